@@ -1,0 +1,35 @@
+"""FDM: a straight line, uniform in time, matched greedily to the demonstration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from latentds.arguments import number_in
+from latentds.base import LatentDS
+from latentds.demonstration import Demonstration, only_demonstration
+from latentds.diffeomorphism import LocallyWeightedTranslations
+from latentds.embedding import place, straight_column
+from latentds.matching import settle
+from latentds.time_law import PiecewiseLinearLaw, RayDynamics
+
+
+class FDM(LatentDS):
+    """Fast diffeomorphic matching (Perrin and Schlehuber-Caissier 2016): ChebyshevDS with another latent line.
+
+    Args:
+        dim: n >= 1.
+        n_layers: M >= 1.
+        beta: β in (0, 1], the share of the largest error that a layer moves.
+        mu: μ in (0, 1), how near to its invertibility bound a layer may come.
+    """
+
+    def __init__(self, dim: int, *, n_layers: int = 150, beta: float = 0.5, mu: float = 0.9) -> None:
+        super().__init__(dim, LocallyWeightedTranslations(dim, n_layers), RayDynamics(dim, PiecewiseLinearLaw.uniform()))
+        self.beta = number_in(beta, "beta", 0, 1, ends="(]")
+        self.mu = number_in(mu, "mu", 0, 1)
+
+    def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> FDM:
+        shown = only_demonstration(demonstration, self.dim, "FDM")
+        latent = place(straight_column(len(shown)), shown.start.numpy(), shown.goal.numpy())
+        settle(self, latent, shown, PiecewiseLinearLaw.uniform(shown.duration), progress=progress)
+        return self

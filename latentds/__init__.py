@@ -1,0 +1,19 @@
+"""latentds: globally stable motions from one demonstration."""
+
+from . import datasets
+from .base import FitReport, LatentDS, StableDS
+from .chebyshev import ChebyshevDS
+from .demonstration import Demonstration
+from .diffeomorphism import Diffeomorphism, LocallyWeightedTranslations
+
+__version__ = "0.1.0"
+__all__ = [
+    "ChebyshevDS",
+    "Demonstration",
+    "Diffeomorphism",
+    "FitReport",
+    "LatentDS",
+    "LocallyWeightedTranslations",
+    "StableDS",
+    "datasets",
+]

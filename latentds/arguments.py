@@ -1,0 +1,70 @@
+"""What every public entry point asks of its arguments: a ValueError names the argument, what was expected, what came."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def whole_number(value: Any, name: str, *, at_least: int) -> int:
+    if isinstance(value, bool) or not hasattr(value, "__index__") or (number := value.__index__()) < at_least:
+        raise ValueError(f"{name}: expected a whole number >= {at_least}, got {value!r}")
+    return number
+
+
+def number_in(value: Any, name: str, low: float, high: float, *, ends: str = "()") -> float:
+    """A hyperparameter in an interval; ``ends`` are its brackets, as in "(]"."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = float("nan")
+    above = number >= low if ends[0] == "[" else number > low
+    below = number <= high if ends[1] == "]" else number < high
+    if not (above and below):
+        raise ValueError(f"{name}: expected a number in {ends[0]}{low:g}, {high:g}{ends[1]}, got {value!r}")
+    return number
+
+
+def real_array(values: Any, name: str) -> np.ndarray:
+    if isinstance(values, Tensor):
+        values = values.detach().cpu().numpy() if values.dtype != torch.bfloat16 else values.detach().cpu().float().numpy()
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind not in "fiu":
+            raise TypeError
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: expected an array of real numbers, got {_describe(values)}") from None
+    return np.array(array, dtype=np.float64)
+
+
+def point_array(values: Any, name: str) -> np.ndarray:
+    array = real_array(values, name)
+    if array.ndim != 2 or array.shape[1] < 1:
+        raise ValueError(f"{name}: expected shape (N, n) with n >= 1, got {array.shape}")
+    if array.shape[0] < 3:
+        raise ValueError(f"{name}: expected at least 3 points, got {array.shape[0]}")
+    if not np.isfinite(array).all():
+        row = int(np.argmin(np.isfinite(array).all(axis=1)))
+        raise ValueError(f"{name}: expected finite numbers, got NaN or inf in row {row}")
+    if (array == array[0]).all():
+        raise ValueError(f"{name}: expected a motion, got {len(array)} equal points")
+    return np.ascontiguousarray(array)
+
+
+def positive(value: Any, name: str) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name}: expected a number > 0, got {_describe(value)}") from None
+    if not (math.isfinite(number) and number > 0):
+        raise ValueError(f"{name}: expected a finite number > 0, got {number:g}")
+    return number
+
+
+def _describe(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) < 60 else type(value).__name__

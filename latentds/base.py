@@ -1,0 +1,150 @@
+"""The one interface of every method: a globally asymptotically stable system that is learned and rolled out."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from .arguments import whole_number
+from .demonstration import Demonstration
+from .diffeomorphism import Diffeomorphism
+from .time_law import LatentDynamics
+
+Self = TypeVar("Self", bound="StableDS")
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What a fit reached.
+
+    Attributes:
+        mse: mean squared error per coordinate (mean over all N n entries), units squared. Position error of the
+            mapped points for matching methods, velocity error for gradient methods; see the method.
+        n_layers: layers of the diffeomorphism.
+        seconds: wall time of the fit.
+        history: loss per epoch, for methods that learn by gradient.
+        notes: what the user should know of this fit (early stop, divergence handled, choices made).
+    """
+
+    mse: float
+    n_layers: int
+    seconds: float
+    history: tuple[float, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+class StableDS(nn.Module, ABC):
+    """A velocity field ẏ = f(y) on R^n, globally asymptotically stable at ``attractor``.
+
+    A new method subclasses this, implements :meth:`fit`, :meth:`forward`, :meth:`lyapunov` and :meth:`rollout`,
+    and certifies itself with :func:`latentds.testing.check_stable_ds`. An unfitted system is stable too.
+
+    Everything is computed in the module's dtype (float64 unless moved with ``.to``) and returned in the dtype of
+    the input. Arrays are accepted where tensors are.
+
+    Args:
+        dim: n >= 1.
+    """
+
+    attractor: Tensor
+    fit_report: FitReport | None
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.dim = whole_number(dim, "dim", at_least=1)
+        self.fit_report = None
+        self.register_buffer("attractor", torch.zeros(self.dim, dtype=torch.float64))
+
+    @abstractmethod
+    def fit(self: Self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> Self:
+        """Learn from a demonstration (or several, where the method can); forgets any fit before; returns self."""
+
+    @abstractmethod
+    def forward(self, y: Tensor) -> Tensor:
+        """Velocity at ``y``: (..., n) -> (..., n), units of y per second."""
+
+    @abstractmethod
+    def lyapunov(self, y: Tensor) -> Tensor:
+        """V(y) >= 0, zero only at the attractor, decreasing along every motion: (..., n) -> (...)."""
+
+    @abstractmethod
+    def rollout(self, y0: Tensor, t: Tensor) -> Tensor:
+        """The motion from ``y0`` at times ``t``: (..., n), (T,) seconds, not decreasing -> (..., T, n).
+
+        The state at ``t[0]`` is ``y0``: ``out[..., 0, :] == y0``.
+        """
+
+    def _points(self, y: Any, name: str = "y") -> tuple[Tensor, torch.dtype]:
+        """``y`` in the module's dtype, and the dtype in which the caller wants the answer."""
+        points = y if isinstance(y, Tensor) else torch.as_tensor(y)
+        if points.ndim == 0 or points.shape[-1] != self.dim:
+            raise ValueError(f"{name}: expected shape (..., {self.dim}), got {tuple(points.shape)}")
+        dtype = self.attractor.dtype
+        wanted = points.dtype if points.is_floating_point() else dtype
+        return (points if points.dtype == dtype else points.to(dtype)), wanted
+
+    def _times(self, t: Any) -> Tensor:
+        """``t`` as seconds since its first entry, in the module's dtype."""
+        times = torch.as_tensor(t, device=self.attractor.device)
+        if times.ndim != 1 or len(times) == 0:
+            raise ValueError(f"t: expected shape (T,) with T >= 1, got {tuple(times.shape)}")
+        times = times.to(torch.float64)
+        if not bool(torch.isfinite(times).all()):
+            raise ValueError("t: expected finite seconds, got NaN or inf")
+        if bool((times.diff() < 0).any()):
+            raise ValueError("t: expected times that do not decrease, got a step back")
+        return (times - times[0]).to(self.attractor.dtype)
+
+
+class LatentDS(StableDS):
+    """A stable system made of a diffeomorphism ψ (latent -> demonstration) and latent dynamics.
+
+    f(y) = J_ψ(x) g(x) with x = ψ⁻¹(y) (paper, eq. 4), V(y) = ‖x - x*‖². Methods subclass it and implement ``fit``.
+
+    Args:
+        dim: n >= 1.
+        diffeomorphism: ψ; the identity until fitted.
+        dynamics: g, with its flow.
+    """
+
+    def __init__(self, dim: int, diffeomorphism: Diffeomorphism, dynamics: LatentDynamics) -> None:
+        super().__init__(dim)
+        self.diffeomorphism = diffeomorphism
+        self.dynamics = dynamics
+
+    def encode(self, y: Tensor) -> Tensor:
+        """ψ⁻¹: demonstration -> latent, (..., n) -> (..., n)."""
+        points, wanted = self._points(y)
+        return self.diffeomorphism.inverse(points).to(wanted)
+
+    def decode(self, x: Tensor) -> Tensor:
+        """ψ: latent -> demonstration, (..., n) -> (..., n)."""
+        points, wanted = self._points(x, "x")
+        return self.diffeomorphism(points).to(wanted)
+
+    def jacobian(self, x: Tensor) -> Tensor:
+        """J_ψ at latent ``x``, in closed form: (..., n) -> (..., n, n)."""
+        points, wanted = self._points(x, "x")
+        return self.diffeomorphism.jacobian(points).to(wanted)
+
+    def forward(self, y: Tensor) -> Tensor:
+        points, wanted = self._points(y)
+        x, push = self.diffeomorphism.linearize(points)
+        return push(self.dynamics(x, points)).to(wanted)
+
+    def lyapunov(self, y: Tensor) -> Tensor:
+        points, wanted = self._points(y)
+        return self.dynamics.lyapunov(self.diffeomorphism.inverse(points)).to(wanted)
+
+    def rollout(self, y0: Tensor, t: Tensor) -> Tensor:
+        points, wanted = self._points(y0, "y0")
+        times = self._times(t)
+        latent = self.dynamics.flow(self.diffeomorphism.inverse(points), times)
+        path = self.diffeomorphism(latent).to(wanted)
+        start = torch.as_tensor(y0).to(wanted)
+        return torch.cat([start.unsqueeze(-2), path[..., 1:, :]], dim=-2)

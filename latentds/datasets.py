@@ -1,0 +1,73 @@
+"""The motions of the paper's studies, made from their formulas."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+
+from .arguments import number_in, whole_number
+from .demonstration import Demonstration
+
+UNSTABLE_COMPLEXITIES = (1, 3, 7, 10, 15)
+STABLE_COMPLEXITIES = (1, 2, 3, 5, 7)
+
+
+def unstable_spiral(c: float, n_points: int = 1000) -> Demonstration:
+    """Spiral on the unit sphere, (sin t cos ct, sin t sin ct, cos t), t in [0, 3.14] (paper, App. E).
+
+    It ends .0016 from the pole at full speed: no stable system made it, hence the name.
+
+    Args:
+        c: complexity, the number of half turns, > 0; the paper uses 1, 3, 7, 10, 15.
+        n_points: N >= 3, even in time.
+    """
+    c = number_in(c, "c", 0, math.inf)
+    t = np.linspace(0, 3.14, whole_number(n_points, "n_points", at_least=3))
+    positions = np.stack([np.sin(t) * np.cos(c * t), np.sin(t) * np.sin(c * t), np.cos(t)], axis=1)
+    return Demonstration(torch.from_numpy(positions), float(t[1] - t[0]), f"unstable c={c:g}")
+
+
+def stable_spiral(c: float, n_points: int = 1000) -> Demonstration:
+    """Spiral on the unit sphere whose angles decay to the goal (paper, App. E): θ' = .3(π-θ), ψ' = .3(2cπ-ψ).
+
+    Euler steps of .003 s from θ = ψ = 0. The paper stops when "the distance between subsequent points" falls below
+    1e-2, which is true at the first step for every c; we stop when the *speed* falls below 1e-2 (after about 15 s) and
+    resample evenly in time.
+
+    Args:
+        c: complexity, the number of turns, > 0; the paper uses 1, 2, 3, 5, 7.
+        n_points: N >= 3, even in time.
+    """
+    c = number_in(c, "c", 0, math.inf)
+    count = whole_number(n_points, "n_points", at_least=3)
+    step = 0.003
+    decay = 1 - 0.3 * step
+    # Euler on θ' = .3(π-θ) is geometric; the speed falls below 1e-2 within 60 s for any c below 1e5.
+    left = decay ** np.arange(int(60 / step))
+    theta, psi = math.pi * (1 - left), 2 * c * math.pi * (1 - left)
+    path = np.stack([np.sin(theta) * np.cos(psi), np.sin(theta) * np.sin(psi), np.cos(theta)], axis=1)
+    speed = np.linalg.norm(np.diff(path, axis=0), axis=1) / step
+    slow = np.flatnonzero(speed < 1e-2)
+    path = path[: slow[0] + 1] if len(slow) else path
+    times = np.arange(len(path)) * step
+    even = np.linspace(0, times[-1], count)
+    positions = np.stack([np.interp(even, times, column) for column in path.T], axis=1)
+    return Demonstration(torch.from_numpy(positions), float(even[1]), f"stable c={c:g}")
+
+
+def archimedean_spiral(n_points: int = 1000) -> Demonstration:
+    """Planar Archimedean spiral of radius .1 m, one and a half turns in 12 s, inward to its centre (paper, App. E)."""
+    count = whole_number(n_points, "n_points", at_least=3)
+    outward = np.linspace(1, 0, count)
+    angle = 3 * math.pi * outward
+    positions = 0.1 * outward[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return Demonstration(torch.from_numpy(positions), 12 / (count - 1), "archimedean")
+
+
+def spiral_suite(n_points: int = 1000) -> list[Demonstration]:
+    """The paper's ten spirals: five unstable, then five stable."""
+    return [unstable_spiral(c, n_points) for c in UNSTABLE_COMPLEXITIES] + [
+        stable_spiral(c, n_points) for c in STABLE_COMPLEXITIES
+    ]

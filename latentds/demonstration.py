@@ -1,0 +1,214 @@
+"""A demonstration: positions sampled at a constant rate, read from and written to plain files."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .arguments import point_array, positive, real_array
+
+
+@dataclass(frozen=True, eq=False)
+class Demonstration:
+    """One motion, shown once: ``N`` positions in ``n`` dimensions, ``dt`` seconds apart.
+
+    Args:
+        positions: (N, n) array or tensor, N >= 3, n >= 1, finite, not all points equal. Any real dtype;
+            kept as a float64 CPU tensor. The last point is the goal.
+        dt: seconds between two points, > 0.
+        name: a label for tables and pictures.
+
+    Raises:
+        ValueError: naming the argument, what was expected and what came.
+    """
+
+    positions: Tensor
+    dt: float
+    name: str = ""
+    velocities: Tensor = field(init=False, repr=False)
+    """(N, n) units per second: second-order finite differences of the positions."""
+
+    def __post_init__(self) -> None:
+        positions = point_array(self.positions, "positions")
+        dt = positive(self.dt, "dt")
+        if not isinstance(self.name, str):
+            raise ValueError(f"name: expected a string, got {type(self.name).__name__}")
+        object.__setattr__(self, "positions", torch.from_numpy(positions))
+        object.__setattr__(self, "dt", dt)
+        velocities = np.gradient(positions, dt, axis=0, edge_order=2)
+        object.__setattr__(self, "velocities", torch.from_numpy(velocities))
+
+    def __repr__(self) -> str:
+        label = f"{self.name!r}, " if self.name else ""
+        return f"Demonstration({label}{len(self)} points, {self.dim}-D, {self.duration:.4g} s)"
+
+    def __len__(self) -> int:
+        return self.positions.shape[0]
+
+    @property
+    def dim(self) -> int:
+        return self.positions.shape[1]
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first point to the last: (N - 1) dt."""
+        return (len(self) - 1) * self.dt
+
+    @property
+    def times(self) -> Tensor:
+        """(N,) seconds, from 0."""
+        return torch.arange(len(self), dtype=torch.float64) * self.dt
+
+    @property
+    def start(self) -> Tensor:
+        return self.positions[0]
+
+    @property
+    def goal(self) -> Tensor:
+        return self.positions[-1]
+
+    @property
+    def size(self) -> float:
+        """Largest extent along a coordinate axis, in the units of the positions."""
+        return float((self.positions.amax(0) - self.positions.amin(0)).max())
+
+    @classmethod
+    def from_times(cls, times: Any, positions: Any, name: str = "") -> Demonstration:
+        """A recording with its own time stamps, resampled linearly to as many evenly spaced points.
+
+        Args:
+            times: (N,) seconds, strictly increasing.
+            positions: (N, n).
+            name: a label.
+
+        Raises:
+            ValueError: if ``times`` does not increase or does not fit ``positions``.
+        """
+        points = point_array(positions, "positions")
+        stamps = real_array(times, "times")
+        if stamps.shape != (len(points),):
+            raise ValueError(f"times: expected shape ({len(points)},), one per position, got {stamps.shape}")
+        if not np.isfinite(stamps).all():
+            raise ValueError("times: expected finite numbers, got NaN or inf")
+        steps = np.diff(stamps)
+        if not (steps > 0).all():
+            row = int(np.argmin(steps > 0))
+            raise ValueError(
+                f"times: expected strictly increasing, got {stamps[row]:g} then {stamps[row + 1]:g} at row {row}"
+            )
+        even = np.linspace(stamps[0], stamps[-1], len(stamps))
+        resampled = np.stack([np.interp(even, stamps, column) for column in points.T], axis=1)
+        return cls(torch.from_numpy(resampled), float(even[-1] - even[0]) / (len(even) - 1), name)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Demonstration:
+        """Read a ``.npz`` (arrays ``positions`` and ``dt`` or ``times``; no pickles) or a ``.csv`` file.
+
+        A CSV has one header line and one row per point; its first column is ``t`` in seconds.
+
+        Raises:
+            ValueError: if the file is neither, is damaged, or does not hold a demonstration.
+            FileNotFoundError: if there is no such file.
+        """
+        path = Path(path)
+        if not path.exists():
+            raise FileNotFoundError(f"path: no such file: {path}")
+        if path.suffix == ".npz":
+            return cls._from_npz(path)
+        if path.suffix == ".csv":
+            return cls._from_csv(path)
+        raise ValueError(f"path: expected a .npz or .csv file, got {path.name!r}")
+
+    @classmethod
+    def _from_npz(cls, path: Path) -> Demonstration:
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {key: file[key] for key in file.files if key in ("positions", "dt", "times", "name")}
+        except Exception as error:
+            raise ValueError(f"path: {path.name} is not a readable .npz without pickles ({error})") from None
+        if "positions" not in arrays or not ({"dt", "times"} & set(arrays)):
+            raise ValueError(
+                f"path: expected arrays 'positions' and 'dt' (or 'times') in {path.name}, got {sorted(arrays)}"
+            )
+        name = str(arrays["name"]) if "name" in arrays else path.stem
+        if "dt" in arrays:
+            if arrays["dt"].size != 1:
+                raise ValueError(f"dt: expected one number in {path.name}, got shape {arrays['dt'].shape}")
+            return cls(arrays["positions"], arrays["dt"].reshape(()).item(), name)
+        return cls.from_times(arrays["times"], arrays["positions"], name)
+
+    @classmethod
+    def _from_csv(cls, path: Path) -> Demonstration:
+        try:
+            with path.open(encoding="utf-8") as file:
+                header = file.readline().strip().split(",")
+                table = np.loadtxt(file, delimiter=",", ndmin=2)
+        except (ValueError, UnicodeDecodeError) as error:
+            raise ValueError(f"path: {path.name} is not a table of numbers under one header line ({error})") from None
+        if header[0] != "t" or len(header) < 2 or (table.size and table.shape[1] != len(header)):
+            raise ValueError(f"path: expected a first column 't' and one more per dimension in {path.name}, got {header}")
+        return cls.from_times(table[:, 0], table[:, 1:], path.stem)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a ``.npz`` (exact) or ``.csv`` (17 digits) file that :meth:`load` reads. Atomic."""
+        path = Path(path)
+        if path.suffix not in (".npz", ".csv"):
+            raise ValueError(f"path: expected a .npz or .csv file, got {path.name!r}")
+        with atomic_write(path) as file:
+            if path.suffix == ".npz":
+                np.savez(file, positions=self.positions.numpy(), dt=self.dt, name=self.name)
+            else:
+                columns = ["t", *(f"y{i}" for i in range(self.dim))]
+                table = np.column_stack([self.times.numpy(), self.positions.numpy()])
+                np.savetxt(file, table, delimiter=",", header=",".join(columns), comments="", fmt="%.17g")
+
+
+class atomic_write:
+    """Open a binary file that takes its place under ``path`` only when the block ends without an error."""
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+
+    def __enter__(self) -> Any:
+        self.file = tempfile.NamedTemporaryFile(dir=self.path.parent, prefix=f".{self.path.name}.", delete=False)
+        return self.file
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.file.flush()
+            os.fsync(self.file.fileno())
+        self.file.close()
+        if kind is None:
+            os.replace(self.file.name, self.path)
+        else:
+            os.unlink(self.file.name)
+
+
+def demonstrations_of(demonstration: Any, dim: int) -> list[Demonstration]:
+    """The argument of ``fit`` as a list of at least one :class:`Demonstration` of dimension ``dim``."""
+    found = [demonstration] if isinstance(demonstration, Demonstration) else demonstration
+    if not isinstance(found, Sequence) or not found or not all(isinstance(d, Demonstration) for d in found):
+        raise ValueError(
+            "demonstration: expected a Demonstration or a non-empty list of them, "
+            f"got {type(demonstration).__name__}" + (" (empty)" if found in ([], ()) else "")
+        )
+    for item in found:
+        if item.dim != dim:
+            raise ValueError(f"demonstration: expected dimension {dim}, got {item.dim} ({item!r})")
+    return list(found)
+
+
+def only_demonstration(demonstration: Any, dim: int, method: str) -> Demonstration:
+    """The argument of ``fit`` for a method that learns from exactly one demonstration."""
+    found = demonstrations_of(demonstration, dim)
+    if len(found) != 1:
+        raise ValueError(f"demonstration: {method} learns from exactly one, got {len(found)}")
+    return found[0]

@@ -1,0 +1,67 @@
+"""Where the latent points lie: the Laplacian eigenmap of the demonstration graph, or an evenly spaced line."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from .arguments import whole_number
+
+Array = NDArray[np.float64]
+
+
+def chebyshev_eigenvalues(n_points: int, dim: int) -> Array:
+    """The smallest eigenvalue of each block H_j, j = 1 … n, of the graph Laplacian with K = n+1 copies: (n,).
+
+    The graph is K copies of a path of N nodes whose last nodes form a K-cycle (paper, Sec. IV). Its Laplacian splits
+    into K tridiagonal blocks (paper, Prop. 2): diagonal 1, 2, …, 2, 3 - 2cos(2πj/K), off-diagonal -1. With λ = 2 - 2cos θ
+    the last row asks cos((N+½)θ) = (2cos(2πj/K) - 1) cos((N-½)θ), whose smallest root lies in (0, π/(2N-1)).
+
+    λN² → π²/4. Blocks j and K-j agree; for odd n the block j = K/2 stands alone, so "n repeating eigenvalues" (paper,
+    Sec. IV-B) holds for even n only.
+
+    Args:
+        n_points: N >= 3.
+        dim: n >= 1.
+    """
+    return 2 - 2 * np.cos(_angles(n_points, dim))
+
+
+def chebyshev_columns(n_points: int, dim: int) -> Array:
+    """The eigenvectors' first N entries, u_i = cos((i+½)θ) / cos(θ/2), i = 0 … N-1, a column per block: (N, n).
+
+    The paper's Prop. 3 prints i = 1 … N, off by one: it gives u_1 = 1 - λ where the recursion starts at 1.
+    """
+    theta = _angles(n_points, dim)
+    index = np.arange(n_points)[:, None]
+    return np.cos((index + 0.5) * theta) / np.cos(theta / 2)
+
+
+def straight_column(n_points: int) -> Array:
+    """Evenly spaced, from 0 at the start to 1 at the goal: (N, 1). FDM's latent line, uniform in time."""
+    return np.linspace(0, 1, n_points)[:, None]
+
+
+def place(columns: Array, start: Array, goal: Array) -> Array:
+    """Map each column affinely so that the rows run from ``start`` to ``goal``, both (n,): (N, n) or (N, 1) -> (N, n).
+
+    A coordinate in which start and goal coincide collapses to it.
+    """
+    progress = (columns - columns[0]) / (columns[-1] - columns[0])
+    placed = start + progress * (goal - start)
+    placed[-1] = goal
+    return placed
+
+
+def _angles(n_points: int, dim: int) -> Array:
+    n = whole_number(n_points, "n_points", at_least=3)
+    copies = whole_number(dim, "dim", at_least=1) + 1
+    edge = math.pi / (2 * n - 1)
+
+    def last_row(theta: float, j: int) -> float:
+        return math.cos((n + 0.5) * theta) - (2 * math.cos(2 * math.pi * j / copies) - 1) * math.cos((n - 0.5) * theta)
+
+    return np.array([brentq(last_row, 0, edge, args=(j,), xtol=1e-18, rtol=1e-15) for j in range(1, copies)])
