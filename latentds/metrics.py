@@ -155,7 +155,7 @@ def _dtw(a: Array, b: Array) -> float:
             best = row[j - 1] if i == 0 else min(row[j - 1], row[j], corner)
             corner = row[j]
             row[j] = distances[j] + best
-    return row[-1]
+    return float(row[-1])
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -170,4 +170,4 @@ def _frechet(a: Array, b: Array) -> float:
             best = row[j - 1] if i == 0 else min(row[j - 1], row[j], corner)
             corner = row[j]
             row[j] = max(distances[j], best)
-    return row[-1]
+    return float(row[-1])
