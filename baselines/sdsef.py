@@ -1,1 +1,307 @@
-class SDSEF: ...
+"""SDS-EF: stable dynamics from Euclideanizing flows, learned by gradient (Rana et al. 2020)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from latentds.arguments import whole_number
+from latentds.base import FitReport, LatentDS
+from latentds.demonstration import Demonstration, demonstrations_of
+from latentds.diffeomorphism import AffineCouplings
+from latentds.time_law import LatentDynamics
+from latentds.training import Plan, descend
+
+PLANS = {
+    "official": Plan(epochs=5000, learning_rate=1e-4, weight_decay=1e-10, clip=0.1, patience=250),
+    "tuned": Plan(epochs=1000, learning_rate=1e-3, n_batches=4, warm_up=0.05, clip=1.0, slack=0.3),
+}
+GUARD = 1e-3
+"""Share of the demonstration's latent length below which the speed falls linearly: a unit vector is not Lipschitz."""
+BEND = 0.05
+"""Scale of the tuned recipe's straightness, in sizes of the demonstration."""
+FAR, KAPPA, TAIL_NODES, MAX_NODES = 1.5, 0.01, 40, 4096
+REST = 1e-2
+"""Share of the mean speed below which the tuned recipe no longer asks for relative accuracy."""
+
+
+class SDSEF(LatentDS):
+    """Stable dynamics by Euclideanizing flows: ẏ = -exp(g(y)) J_φ⁻¹ z/‖z‖, z = φ(y) - φ(y*) (Rana et al. 2020).
+
+    φ = ψ⁻¹ is a chain of affine couplings and g a small network; both are learned together from velocities. Learns
+    from one demonstration or from several, pooled; their goals' mean is the attractor.
+
+    ``recipe="official"`` minimises the SmoothL1 error of the velocities as the authors' code does. From a single
+    winding demonstration it learns shortcuts, so ``"tuned"``, our own, also asks that the demonstration lie on one
+    latent ray, which is where every motion of this system runs.
+
+    ``fit_report.mse`` is the mean over all N n entries of the squared velocity error, (units / second)².
+
+    Args:
+        dim: n >= 1.
+        n_layers: L >= 1, couplings.
+        n_features: F >= 1, random Fourier features in each half of a coupling.
+        recipe: "tuned" or "official".
+        seed: of the frozen features, the initial network and the batches; None draws them from torch's generator.
+    """
+
+    diffeomorphism: AffineCouplings
+    dynamics: NormalizedDescent
+
+    def __init__(
+        self, dim: int, *, n_layers: int = 10, n_features: int = 200, recipe: str = "tuned", seed: int | None = None
+    ) -> None:
+        if recipe not in PLANS:
+            raise ValueError(f"recipe: expected one of {sorted(PLANS)}, got {recipe!r}")
+        self_seed = None if seed is None else whole_number(seed, "seed", at_least=0)
+        generator = _generator(self_seed)
+        psi = AffineCouplings(dim, n_layers, n_features, generator=generator)
+        super().__init__(dim, psi, NormalizedDescent(psi, generator=generator))
+        self.recipe = recipe
+        self.seed = self_seed
+
+    def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> SDSEF:
+        shown = demonstrations_of(demonstration, self.dim)
+        began = time.perf_counter()
+        psi = self.diffeomorphism
+        # A fresh system is trained, in float32 and in normalised units: twice as fast as float64, no worse, and the
+        # rounding hides the noise of the units that the demonstration came in. An interrupted fit leaves self alone.
+        learner = SDSEF(
+            self.dim, n_layers=psi.n_layers, n_features=psi.n_features, recipe=self.recipe, seed=self.seed
+        ).to(self.attractor.device, torch.float32)
+        data = _Normalized.of(shown)
+        loss = (_tuned_loss if self.recipe == "tuned" else _official_loss)(learner, data)
+        training = descend(
+            loss,
+            list(learner.parameters()),
+            len(data.points) if self.recipe == "official" else len(data.points) - len(shown),
+            PLANS[self.recipe],
+            generator=_generator(self.seed),
+            progress=progress,
+        )
+        self.load_state_dict(learner.state_dict())
+        self._place(data, shown)
+        with torch.no_grad():
+            missed = [self(d.positions.to(self.attractor)) - d.velocities.to(self.attractor) for d in shown]
+            mse = float(torch.cat(missed).square().mean())
+        self.fit_report = FitReport(mse, psi.n_layers, time.perf_counter() - began, training.history, training.notes)
+        return self
+
+    @torch.no_grad()
+    def _place(self, data: _Normalized, shown: Sequence[Demonstration]) -> None:
+        """From normalised units to those of the demonstrations."""
+        psi, dynamics = self.diffeomorphism, self.dynamics
+        psi.center.copy_(data.center)
+        psi.scale.copy_(data.scale)
+        self.attractor.copy_(torch.stack([d.goal for d in shown]).mean(0))
+        dynamics.attractor.copy_(psi.inverse(self.attractor))
+        dynamics.duration.fill_(data.duration)
+        starts = psi.inverse(torch.stack([d.start for d in shown]).to(self.attractor))
+        dynamics.length.copy_((starts - dynamics.attractor).norm(dim=-1).max())
+        log_speeds = dynamics.network(data.points.to(self.attractor))
+        dynamics.log_speed_range.copy_(torch.stack([log_speeds.min() - 1, log_speeds.max() + 1]))
+
+
+class NormalizedDescent(LatentDynamics):
+    """ẋ = -exp(g(y)) z / max(‖z‖, ε), z = x - x*: straight to the goal, at a speed that is a function of y = ψ(x).
+
+    g, a network of 2 x 100 leaky ReLUs over normalised y, is held within the range that it had along the
+    demonstration, widened by 1 each way, so that speeds far away stay bounded and above 0. ε is ``GUARD`` ``length``.
+
+    Args:
+        diffeomorphism: ψ, for :meth:`flow` and for normalising; a reference, not a submodule.
+        generator: draws the network's weights (torch's global one if None).
+
+    Attributes:
+        duration: () buffer, seconds in one unit of time of g.
+        length: () buffer, latent distance of the demonstrated start from x*.
+        log_speed_range: (2,) buffer.
+    """
+
+    duration: Tensor
+    length: Tensor
+    log_speed_range: Tensor
+    psi: AffineCouplings
+
+    def __init__(self, diffeomorphism: AffineCouplings, *, generator: torch.Generator | None = None) -> None:
+        super().__init__(diffeomorphism.dim)
+        object.__setattr__(self, "psi", diffeomorphism)
+        sizes = [diffeomorphism.dim, 100, 100, 1]
+        linear = [_linear(a, b, generator) for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
+        self.network = nn.Sequential(linear[0], nn.LeakyReLU(), linear[1], nn.LeakyReLU(), linear[2])
+        self.register_buffer("duration", torch.ones((), dtype=torch.float64))
+        self.register_buffer("length", torch.ones((), dtype=torch.float64))
+        self.register_buffer("log_speed_range", torch.tensor([-1.0, 1.0], dtype=torch.float64))
+
+    def forward(self, x: Tensor, y: Tensor) -> Tensor:
+        offset = x - self.attractor
+        distance = torch.linalg.vector_norm(offset, dim=-1).clamp(min=GUARD * self.length)
+        return -(self.speed(y) / distance).unsqueeze(-1) * offset
+
+    def speed(self, y: Tensor) -> Tensor:
+        """exp(g(y)), latent units per second: (..., n) -> (...)."""
+        log_speed = self.network(self.psi.normalize(y)).squeeze(-1)
+        return torch.exp(log_speed.clamp(*self.log_speed_range)) / self.duration
+
+    def flow(self, x: Tensor, t: Tensor) -> Tensor:
+        """Every motion runs on the ray from x to x*, so only its timing is integrated.
+
+        The ray is sampled evenly in w, a C¹ function of the distance r that is linear along the demonstration,
+        log r below the guard and logarithmic far outside. dt/dw is known at the nodes, the times there follow by a
+        rule of fourth order, and w at the given times by cubic Hermite interpolation.
+        """
+        offset = x - self.attractor
+        floor = torch.finfo(x.dtype).tiny ** 0.25
+        distance = (offset.square().sum(-1) + (floor * self.length) ** 2).sqrt()
+        begin = self._stretch(distance)
+        end = begin.detach().clamp(max=0.0) - TAIL_NODES
+        spread = torch.nan_to_num((begin.detach() - end).amax() if begin.numel() else begin.new_tensor(1.0), posinf=0)
+        n_cells = int(spread.clamp(8, MAX_NODES).ceil())
+        step = (begin - end) / n_cells
+        nodes = begin.unsqueeze(-1) - step.unsqueeze(-1) * torch.arange(n_cells + 1, dtype=x.dtype, device=x.device)
+        radii, growth = self._unstretch(nodes)
+        direction = (offset / distance.unsqueeze(-1)).unsqueeze(-2)
+        path = self.psi(self.attractor + radii.unsqueeze(-1) * direction)
+        speed = self.speed(path) * (radii / (GUARD * self.length)).clamp(max=1.0)
+        slowness = growth / speed * step.unsqueeze(-1)
+        stamps = _cumulative(slowness)
+        times = t.expand(*stamps.shape[:-1], -1).clamp(max=stamps[..., -1:])
+        cell = torch.searchsorted(stamps.detach(), times.detach().contiguous(), right=True).clamp(1, n_cells) - 1
+        here, there = stamps.gather(-1, cell), stamps.gather(-1, cell + 1)
+        first, last = slowness.gather(-1, cell), slowness.gather(-1, cell + 1)
+        along = cell + _hermite((times - here) / (there - here), (there - here) / first, (there - here) / last)
+        later, _ = self._unstretch(begin.unsqueeze(-1) - step.unsqueeze(-1) * along)
+        return self.attractor + later.unsqueeze(-1) * direction
+
+    def _stretch(self, r: Tensor) -> Tensor:
+        """w(r): log(r/ε) below the guard ε, r/ε - 1 up to FAR lengths, then asinh(κ(w - w_far))/κ + w_far."""
+        unit = r / (GUARD * self.length)
+        edge = FAR / GUARD
+        beyond = torch.asinh(((unit - edge) * KAPPA).clamp(min=0)) / KAPPA
+        return torch.log(unit.clamp(max=1.0)) + unit.clamp(1.0, edge) - 1 + beyond
+
+    def _unstretch(self, w: Tensor) -> tuple[Tensor, Tensor]:
+        """r(w) and dr/dw."""
+        edge = FAR / GUARD - 1
+        tail = torch.exp(w.clamp(max=0.0))
+        beyond = ((w - edge) * KAPPA).clamp(min=0)
+        scale = GUARD * self.length
+        return scale * (tail + w.clamp(0.0, edge) + torch.sinh(beyond) / KAPPA), scale * tail * torch.cosh(beyond)
+
+
+class _Normalized(NamedTuple):
+    """Demonstrations in units of their box and their duration, the last points last."""
+
+    points: Tensor
+    """(N, n) in [-1/2, 1/2]"""
+    velocities: Tensor
+    """(N, n)"""
+    owner: Tensor
+    """(N,) which demonstration"""
+    starts: Tensor
+    """(m, n)"""
+    goal: Tensor
+    """(n,)"""
+    center: Tensor
+    scale: Tensor
+    duration: float
+
+    @classmethod
+    def of(cls, shown: Sequence[Demonstration]) -> _Normalized:
+        goal = torch.stack([d.goal for d in shown]).mean(0)
+        if any(bool((d.start == goal).all()) for d in shown):
+            raise ValueError("demonstration: expected a goal apart from the start, got a closed loop")
+        every = torch.cat([d.positions for d in shown])
+        low, high = every.amin(0), every.amax(0)
+        center, extent = (low + high) / 2, high - low
+        scale = extent.clamp(min=1e-6 * float(extent.max()))  # an axis at rest is noise, not motion
+        duration = sum(d.duration for d in shown) / len(shown)
+        order = torch.cat([torch.arange(len(d)) == len(d) - 1 for d in shown]).to(torch.uint8).argsort(stable=True)
+        owner = torch.cat([torch.full((len(d),), i) for i, d in enumerate(shown)])
+        return cls(
+            ((every - center) / scale)[order],
+            (torch.cat([d.velocities for d in shown]) / scale * duration)[order],
+            owner[order],
+            (torch.stack([d.start for d in shown]) - center) / scale,
+            (goal - center) / scale,
+            center,
+            scale,
+            duration,
+        )
+
+
+def _official_loss(learner: SDSEF, data: _Normalized) -> Callable[[Tensor], Tensor]:
+    points, velocities, goal = (part.to(learner.attractor) for part in (data.points, data.velocities, data.goal))
+    psi, network = learner.diffeomorphism, learner.dynamics.network
+
+    def loss(batch: Tensor) -> Tensor:
+        u = points[batch]
+        x, push = psi.linearize(torch.cat([u, goal.unsqueeze(0)]))
+        z = x - x[-1]
+        heading = z / torch.linalg.vector_norm(z, dim=-1, keepdim=True).clamp(min=1e-6)
+        predicted = -network(u).exp() * push(heading)[:-1]
+        return nn.functional.smooth_l1_loss(predicted, velocities[batch])
+
+    return loss
+
+
+def _tuned_loss(learner: SDSEF, data: _Normalized) -> Callable[[Tensor], Tensor]:
+    """2 mean(√(1 + ‖v̂-v‖²/‖v‖²) - 1) + mean(√(1 + ‖J_φ⁻¹ d / .05‖²) - 1) + mean ‖z/‖z‖ - e‖².
+
+    e is the direction of z at the demonstrated start and d = z - max(0, z·e) e the way off the ray along it.
+    """
+    points, velocities, starts, goal = (
+        part.to(learner.attractor) for part in (data.points, data.velocities, data.starts, data.goal)
+    )
+    owner = data.owner.to(points.device)
+    psi, network = learner.diffeomorphism, learner.dynamics.network
+    squared_speeds = velocities.square().sum(-1)
+    squared_speeds = squared_speeds + REST**2 * squared_speeds.mean()
+    anchors = torch.cat([starts, goal.unsqueeze(0)])
+
+    def loss(batch: Tensor) -> Tensor:
+        u, v, n = points[batch], velocities[batch], len(batch)
+        x, push = psi.linearize(torch.cat([u, anchors]))
+        z = x - x[-1]
+        heading = z / torch.linalg.vector_norm(z, dim=-1, keepdim=True).clamp(min=1e-6)
+        ray = heading[n:-1][owner[batch]]
+        aside = z[:n] - (z[:n] * ray).sum(-1, keepdim=True).clamp(min=0) * ray
+        aside = torch.cat([aside, torch.zeros_like(anchors)])
+        flow, away = push(torch.stack([heading, aside]))[:, :n]
+        error = (-network(u).exp() * flow - v).square().sum(-1) / squared_speeds[batch]
+        bend = (away / BEND).square().sum(-1)
+        turn = (heading[:n] - ray).square().sum(-1)
+        return (2 * ((1 + error).sqrt() - 1) + (1 + bend).sqrt() - 1 + turn).mean()
+
+    return loss
+
+
+def _cumulative(f: Tensor) -> Tensor:
+    """Integrals from the first node to each, (..., K + 1) with unit spacing, of fourth order, K >= 3."""
+    inner = (13 * (f[..., 1:-2] + f[..., 2:-1]) - f[..., :-3] - f[..., 3:]) / 24
+    first = (9 * f[..., 0] + 19 * f[..., 1] - 5 * f[..., 2] + f[..., 3]) / 24
+    last = (9 * f[..., -1] + 19 * f[..., -2] - 5 * f[..., -3] + f[..., -4]) / 24
+    cells = torch.cat([first.unsqueeze(-1), inner, last.unsqueeze(-1)], -1)
+    return torch.cat([torch.zeros_like(cells[..., :1]), cells.clamp(min=0).cumsum(-1)], -1)
+
+
+def _hermite(s: Tensor, left: Tensor, right: Tensor) -> Tensor:
+    """From 0 to 1 over s in [0, 1], with slopes ``left`` at 0 and ``right`` at 1."""
+    return s * (left + s * (3 - 2 * left - right + s * (left + right - 2)))
+
+
+def _generator(seed: int | None) -> torch.Generator | None:
+    return None if seed is None else torch.Generator().manual_seed(seed)
+
+
+def _linear(n_in: int, n_out: int, generator: torch.Generator | None) -> nn.Linear:
+    """torch's own initial weights, but from a generator and without touching the global one."""
+    layer = torch.nn.utils.skip_init(nn.Linear, n_in, n_out, dtype=torch.float64)
+    bound = n_in**-0.5
+    for part in (layer.weight, layer.bias):
+        nn.init.uniform_(part, -bound, bound, generator=generator)
+    return layer
