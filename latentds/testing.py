@@ -145,8 +145,9 @@ def _told(error: Exception) -> str:
 def _same(got: Tensor, wanted: Tensor, what: str, *, relative: float = 1e-9) -> None:
     _expect(got.shape == wanted.shape, f"{what}: expected shape {tuple(wanted.shape)}, got {tuple(got.shape)}")
     _expect(bool(torch.isfinite(got).all()), f"{what}: expected finite numbers")
-    gap = float((got - wanted).abs().max()) if got.numel() else 0.0
-    scale = float(wanted.abs().max()) if wanted.numel() else 0.0
+    if not got.numel():
+        return
+    gap, scale = float((got - wanted).detach().abs().max()), float(wanted.detach().abs().max())
     _expect(gap <= relative * scale, f"{what}: off by {gap:.3g} at a scale of {scale:.3g}")
 
 
@@ -160,7 +161,8 @@ def _batches(case: _Case) -> None:
             y = case.probes[:count].reshape(*shape, case.dim)
             _same(ds(y), velocity[:count].reshape(y.shape), f"velocity of batch {shape}")
             _same(ds.lyapunov(y), energy[:count].reshape(shape), f"V of batch {shape}")
-            _same(ds.rollout(y, times), paths[:count].reshape(*shape, 5, case.dim), f"rollout of batch {shape}")
+            wanted = paths[:count].reshape(*shape, 5, case.dim)
+            _same(ds.rollout(y, times), wanted, f"rollout of batch {shape}", relative=1e-6)
         _expect(bool((ds.rollout(case.probes, times)[:, 0] == case.probes).all()), "rollout does not begin at y0")
         _same(ds.rollout(case.probes, times + 7), paths, "rollout at times that begin at 7 s")
 

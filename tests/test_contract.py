@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
-import pytest
+from dataclasses import replace
 
-from baselines import FDM
-from latentds import ChebyshevDS
-from latentds.testing import check_stable_ds
+import pytest
+import torch
+
+import baselines.sdsef
+from baselines import FDM, SDSEF
+from latentds import ChebyshevDS, Demonstration
+from latentds.testing import check_stable_ds, wavy_motion
 
 METHODS = {
     "ChebyshevDS": lambda dim: ChebyshevDS(dim, n_layers=30),
     "FDM": lambda dim: FDM(dim, n_layers=30),
+    "SDSEF": lambda dim: SDSEF(dim, n_layers=4, n_features=20, seed=0),
 }
+
+
+@pytest.fixture(autouse=True)
+def _short_training(monkeypatch):
+    plan = baselines.sdsef.PLANS["tuned"]
+    monkeypatch.setitem(baselines.sdsef.PLANS, "tuned", replace(plan, epochs=25))
 
 
 @pytest.mark.parametrize("fitted", [False, True], ids=["unfitted", "fitted"])
@@ -19,3 +30,23 @@ METHODS = {
 @pytest.mark.parametrize("method", METHODS)
 def test_contract(method, dim, fitted):
     check_stable_ds(METHODS[method], dims=[dim], fitted=[fitted])
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_where_the_motion_lies_does_not_matter(method):
+    """Beyond the contract: ours do not mind where the origin is, to what training makes of another rounding."""
+    shown, shift = wavy_motion(3), torch.tensor([8.0, -4.0, 2.0], dtype=torch.float64)
+    here = METHODS[method](3).fit(shown)
+    there = METHODS[method](3).fit(Demonstration(shown.positions + shift, shown.dt))
+    with torch.no_grad():
+        wanted = here(shown.positions)
+        torch.testing.assert_close(
+            there(shown.positions + shift), wanted, rtol=0, atol=1e-3 * float(wanted.abs().max())
+        )
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_random_state_is_untouched(method):
+    before = torch.get_rng_state()
+    METHODS[method](2).fit(wavy_motion(2))
+    assert torch.equal(before, torch.get_rng_state())
