@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -11,7 +12,7 @@ from torch import Tensor, nn
 from .arguments import positive
 
 TAIL = 1e-3
-"""Progress below which every law turns linear, ṡ ∝ -s: laws that reach the goal in finite time are not Lipschitz there."""
+"""Progress below which every law turns linear, ṡ ∝ -s: one that reaches the goal in finite time is not Lipschitz there."""
 
 
 class TimeLaw(nn.Module, ABC):
@@ -86,17 +87,53 @@ class PiecewiseLinearLaw(TimeLaw):
     def __init__(self, knots: Tensor, speeds: Tensor) -> None:
         super().__init__()
         knots, speeds = torch.as_tensor(knots, dtype=torch.float64), torch.as_tensor(speeds, dtype=torch.float64)
-        if knots.ndim != 1 or len(knots) < 1 or not bool((knots.diff() > 0).all()) or not float(knots[0]) > 0:
-            raise ValueError(f"knots: expected (m,) increasing from above 0, got {knots}")
-        if speeds.shape != knots.shape or not bool((speeds > 0).all()):
-            raise ValueError(f"speeds: expected {tuple(knots.shape)} numbers > 0, got {speeds}")
+        _check_knots(knots, speeds)
         self.register_buffer("knots", knots)
         self.register_buffer("speeds", speeds)
 
     @classmethod
     def uniform(cls, duration: float = 1.0) -> PiecewiseLinearLaw:
         """Constant rate 1 / duration above the tail: the line that FDM moves on."""
-        return cls(torch.tensor([TAIL]), torch.tensor([1 / positive(duration, "duration")], dtype=torch.float64))
+        speed = 1 / positive(duration, "duration")
+        return cls(torch.tensor([TAIL], dtype=torch.float64), torch.tensor([speed], dtype=torch.float64))
+
+    @classmethod
+    def from_timing(cls, progress: Tensor, times: Tensor, n_knots: int = 256) -> PiecewiseLinearLaw:
+        """The law under which progress falls as shown: a demonstrated time law.
+
+        Knots lie where progress and time, both as shares, advance evenly together, so that slow and fast parts are
+        resolved alike; their speeds are settled until the time between any two knots is the demonstrated one. Above 1
+        the speed rises (or falls) to the mean within 2 % of the way, so that a start at rest does not hold up
+        what starts behind it.
+
+        Args:
+            progress: (m,) strictly decreasing from 1 to 0.
+            times: (m,) seconds, strictly increasing from 0.
+            n_knots: most knots.
+        """
+        s, t = progress.to(torch.float64).cpu().numpy(), times.to(torch.float64).cpu().numpy()
+        clock = (1 - s) + t / t[-1]
+        even = np.interp(np.linspace(0, 2, n_knots), clock, s)
+        even = even[even > 2 * TAIL]
+        apart = np.concatenate([[True], -np.diff(even) > 1e-6])
+        knots = np.concatenate([even[apart], [TAIL]])[::-1]
+        arrivals = np.interp(-knots, -s, t)
+        spans = np.maximum(-np.diff(arrivals), 1e-9 * t[-1])
+        gaps = np.diff(knots)
+        pace = np.interp(knots, (knots[1:] + knots[:-1]) / 2, spans / gaps)
+        speeds = 1 / pace
+        for _ in range(30):  # the time over a segment is gap · log(b/a) / (b-a): nudge both ends by what it lacks
+            low, high = speeds[:-1], speeds[1:]
+            ratio = high / low
+            bend = np.where(np.abs(ratio - 1) < 1e-6, 1.0, np.log(ratio) / np.where(ratio == 1, 1.0, ratio - 1))
+            excess = np.log(gaps / low * bend / spans)
+            nudge = np.zeros_like(speeds)
+            nudge[:-1] += excess
+            nudge[1:] += excess
+            nudge[1:-1] /= 2
+            speeds = speeds * np.exp(0.5 * nudge)
+        mean = 1 / t[-1]
+        return cls(torch.from_numpy(np.append(knots, 1.02)), torch.from_numpy(np.append(speeds, mean)))
 
     def speed(self, s: Tensor) -> Tensor:
         low, high = self._segment(torch.bucketize(s.detach(), self.knots))
@@ -119,6 +156,25 @@ class PiecewiseLinearLaw(TimeLaw):
         tail = self.knots[0] * torch.exp(self.speeds[0] / self.knots[0] * time.clamp(max=0.0))
         return torch.where(index == 0, tail, inside)
 
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        """A fit chooses how many knots there are, so a fresh law takes any number."""
+        knots, speeds = state_dict.get(prefix + "knots"), state_dict.get(prefix + "speeds")
+        if knots is not None and speeds is not None:
+            try:
+                _check_knots(knots, speeds)
+            except ValueError as error:
+                rest[-1].append(str(error))  # load_state_dict's list of what went wrong
+                return
+            self.knots, self.speeds = self.knots.new_empty(knots.shape), self.speeds.new_empty(speeds.shape)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
+        for name in ("knots", "speeds"):  # a fit chooses how many
+            stored = state_dict.get(prefix + name)
+            if isinstance(stored, Tensor) and stored.ndim == 1:
+                setattr(self, name, getattr(self, name).new_ones(stored.shape))
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
     def _arrivals(self) -> Tensor:
         """Seconds from each knot to the first one, (m,)."""
         gaps = self.knots.diff()
@@ -132,6 +188,14 @@ class PiecewiseLinearLaw(TimeLaw):
         speeds = torch.cat([zero, self.speeds, self.speeds[-1:]])
         arrivals = torch.cat([zero, self._arrivals()])
         return (knots[index], speeds[index], arrivals[index]), (knots[index + 1], speeds[index + 1])
+
+
+def _check_knots(knots: Tensor, speeds: Tensor) -> None:
+    increasing = knots.ndim == 1 and len(knots) > 0 and bool((knots.diff() > 0).all()) and float(knots[0]) > 0
+    if not (increasing and bool(torch.isfinite(knots).all())):
+        raise ValueError(f"knots: expected (m,) finite numbers increasing from above 0, got {knots}")
+    if speeds.shape != knots.shape or not bool(((speeds > 0) & torch.isfinite(speeds)).all()):
+        raise ValueError(f"speeds: expected {tuple(knots.shape)} finite numbers > 0, got {speeds}")
 
 
 def _travel_time(distance: Tensor, speed: Tensor, slope: Tensor) -> Tensor:
@@ -192,20 +256,67 @@ class RayDynamics(LatentDynamics):
         self.length.copy_(torch.linalg.vector_norm(start.to(torch.float64) - attractor.to(torch.float64)))
 
     def forward(self, x: Tensor, y: Tensor) -> Tensor:
-        offset, s = self._polar(x)
-        return -self._rate(s).unsqueeze(-1) * offset
+        offset = x - self.attractor
+        s = _off_zero(offset / self.length)
+        return -(self.law.speed(s) / s) * offset
 
     def flow(self, x: Tensor, t: Tensor) -> Tensor:
-        offset, s = self._polar(x)
-        later = self.law.progress_at(self.law.time_to_go(s).unsqueeze(-1) - t)
-        return self.attractor + (later / s.unsqueeze(-1)).unsqueeze(-1) * offset.unsqueeze(-2)
+        offset = (x - self.attractor).unsqueeze(-2)
+        return self.attractor + _shrink(self.law, _off_zero(offset / self.length), t) * offset
 
-    def _rate(self, s: Tensor) -> Tensor:
-        return self.law.speed(s) / s
 
-    def _polar(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """x - x*, and the progress s, held off zero far inside the linear tail where h(s)/s no longer changes."""
-        offset = x - self.attractor
-        floor = torch.finfo(x.dtype).tiny ** 0.25
-        unit = offset / self.length
-        return offset, (unit.square().sum(-1) + floor**2).sqrt()
+class TubeDynamics(LatentDynamics):
+    """Along the axis to the goal by ``law``, and across it inward at ``rate``: ṡ = -h(s), h odd, and ṗ = -κp.
+
+    With u the axis from x* to the demonstrated start and ``length`` their distance, s = u·(x - x*)/length and p is the
+    rest. Beyond ``radius`` from the axis the pull is held at κ·radius, so that a far start makes no wild speed.
+
+    Attributes:
+        axis: u, (n,).
+        length: distance of the demonstrated start from x*, > 0.
+    """
+
+    axis: Tensor
+    length: Tensor
+
+    def __init__(self, dim: int, law: TimeLaw, pull: TimeLaw) -> None:
+        super().__init__(dim)
+        self.law = law
+        self.pull = pull
+        self.register_buffer("axis", torch.eye(dim, dtype=torch.float64)[0])
+        self.register_buffer("length", torch.ones((), dtype=torch.float64))
+
+    def aim(self, start: Tensor, attractor: Tensor) -> None:
+        """Set where the demonstration starts and ends in latent space, both (n,)."""
+        self.attractor.copy_(attractor)
+        offset = start.to(torch.float64) - attractor.to(torch.float64)
+        self.length.copy_(torch.linalg.vector_norm(offset))
+        self.axis.copy_(offset / torch.linalg.vector_norm(offset))
+
+    def forward(self, x: Tensor, y: Tensor) -> Tensor:
+        along, across = self._split(x)
+        s, p = _off_zero(along), _off_zero(across)
+        inward = self.law.speed(s) / s * along * self.axis + self.pull.speed(p) / p * across
+        return -self.length * inward
+
+    def flow(self, x: Tensor, t: Tensor) -> Tensor:
+        along, across = (part.unsqueeze(-2) for part in self._split(x))
+        left = _shrink(self.law, _off_zero(along), t) * along * self.axis
+        return self.attractor + self.length * (left + _shrink(self.pull, _off_zero(across), t) * across)
+
+    def _split(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Offset from x* in units of length: along the axis (..., 1) and across it (..., n)."""
+        offset = (x - self.attractor) / self.length
+        along = (offset * self.axis).sum(-1, keepdim=True)
+        return along, offset - along * self.axis
+
+
+def _shrink(law: TimeLaw, s: Tensor, t: Tensor) -> Tensor:
+    """What is left after ``t`` (T,) of the length s (..., 1, 1): the ratio, (..., T, 1)."""
+    return law.progress_at(law.time_to_go(s) - t.unsqueeze(-1)) / s
+
+
+def _off_zero(offset: Tensor) -> Tensor:
+    """Length of (..., n) as (..., 1), held off zero far inside the linear tail, where h(s)/s no longer changes."""
+    floor = torch.finfo(offset.dtype).tiny ** 0.25
+    return (offset.square().sum(-1, keepdim=True) + floor**2).sqrt()

@@ -1,0 +1,156 @@
+"""The time laws' closed-form flow against an ODE solver and against quadrature."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import quad, solve_ivp
+
+from latentds.time_law import TAIL, ChebyshevLaw, PiecewiseLinearLaw, RayDynamics
+
+
+def random_law(seed, n_knots):
+    draw = np.random.default_rng(seed)
+    knots = np.sort(draw.uniform(TAIL, 1.5, n_knots))
+    return PiecewiseLinearLaw(torch.from_numpy(knots), torch.from_numpy(np.exp(draw.uniform(-3, 2, n_knots))))
+
+
+LAWS = {
+    "chebyshev": ChebyshevLaw(2.5),
+    "uniform": PiecewiseLinearLaw.uniform(2.5),
+    "one knot": random_law(0, 1),
+    "five knots": random_law(1, 5),
+    "sixty knots": random_law(2, 60),
+    "flat": PiecewiseLinearLaw(torch.tensor([0.1, 0.5, 0.9]), torch.tensor([2.0, 2.0, 2.0])),
+    "nearly flat": PiecewiseLinearLaw(torch.tensor([0.1, 0.5, 0.9]), torch.tensor([2.0, 2.0 + 1e-9, 2.0])),
+}
+
+
+@pytest.fixture(params=LAWS.values(), ids=LAWS.keys())
+def law(request):
+    return request.param
+
+
+def progress(low=1e-6, high=3.0, count=200):
+    return torch.logspace(np.log10(low), np.log10(high), count, dtype=torch.float64)
+
+
+def test_speed_is_positive_and_zero_at_the_goal(law):
+    assert (law.speed(progress()) > 0).all()
+    assert law.speed(torch.zeros(1, dtype=torch.float64)).item() == 0
+
+
+def test_speed_is_continuous(law):
+    s = torch.linspace(0, 2, 400_001, dtype=torch.float64)
+    assert law.speed(s).diff().abs().max() < 6e-3 * law.speed(s).max()
+
+
+def test_time_to_go_is_the_integral_of_one_over_speed(law):
+    edges = sorted({TAIL, 1.0, *getattr(law, "knots", torch.zeros(0)).tolist()})
+    for low, high in [(2e-4, 8e-4), (TAIL, 0.01), (0.05, 0.9), (0.5, 2.5)]:
+        inner = [edge for edge in edges if low < edge < high]
+        points = [low, *inner, high]
+        seconds = sum(
+            quad(lambda s: 1 / law.speed(torch.tensor([s], dtype=torch.float64)).item(), a, b, epsrel=1e-10)[0]
+            for a, b in pairwise(points)
+        )
+        found = law.time_to_go(torch.tensor([low, high], dtype=torch.float64)).diff().item()
+        assert found == pytest.approx(seconds, rel=1e-8)
+
+
+def test_progress_at_inverts_time_to_go(law):
+    s = progress()
+    time = law.time_to_go(s)
+    assert (time.diff() > 0).all()
+    torch.testing.assert_close(law.progress_at(time), s, rtol=1e-9, atol=0)
+
+
+def test_flow_agrees_with_solve_ivp(law):
+    times = np.linspace(0, 2.0, 9)
+    starts = np.array([2e-4, 0.3, 1.0, 1.7])
+    solved = solve_ivp(
+        lambda _, s: -law.speed(torch.from_numpy(s)).numpy(), (0, 2.0), starts, "LSODA", times, rtol=1e-10, atol=1e-13
+    )
+    found = law.progress_at(law.time_to_go(torch.from_numpy(starts)).unsqueeze(-1) - torch.from_numpy(times))
+    assert np.abs(found.numpy() - solved.y).max() < 1e-7
+
+
+def test_law_needs_its_duration():
+    """From the start to the edge of the tail; the tail takes what is left."""
+    assert ChebyshevLaw(3.0).time_to_go(torch.ones(1, dtype=torch.float64)).item() == pytest.approx(3.0, rel=0.03)
+    uniform = PiecewiseLinearLaw.uniform(3.0).time_to_go(torch.ones(1, dtype=torch.float64)).item()
+    assert uniform == pytest.approx(3.0 * (1 - TAIL), rel=1e-12)
+
+
+def test_gradients_of_the_flow(law):
+    s = torch.tensor([5e-4, 0.02, 0.33, 0.77, 1.2], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda s: law.progress_at(law.time_to_go(s) - 0.05), (s,))
+    assert torch.autograd.gradcheck(law.speed, (s,))
+
+
+def test_a_law_with_other_knots_loads(law):
+    """A fit may choose how many knots; a fresh law takes them."""
+    fresh = ChebyshevLaw() if isinstance(law, ChebyshevLaw) else PiecewiseLinearLaw.uniform()
+    fresh.load_state_dict(law.state_dict())
+    assert torch.equal(fresh.speed(progress()), law.speed(progress()))
+
+
+def test_a_law_that_breaks_its_own_rules_does_not_load():
+    state = {"knots": torch.tensor([0.5, 0.2]), "speeds": torch.tensor([1.0, 1.0])}
+    with pytest.raises(RuntimeError, match="knots"):
+        PiecewiseLinearLaw.uniform().load_state_dict(state)
+
+
+@pytest.mark.parametrize("dim", [1, 3])
+def test_rays_go_straight_to_the_goal(law, dim, draw):
+    dynamics = RayDynamics(dim, law)
+    goal, start = torch.randn(2, dim, generator=draw, dtype=torch.float64)
+    dynamics.aim(start, goal)
+    x = goal + torch.randn(6, dim, generator=draw, dtype=torch.float64)
+    times = torch.linspace(0, 1, 5, dtype=torch.float64)
+    path = dynamics.flow(x, times)
+    torch.testing.assert_close(path[:, 0], x, rtol=1e-12, atol=1e-12)
+    share = (path - goal).norm(dim=-1, keepdim=True) / (x - goal).norm(dim=-1, keepdim=True).unsqueeze(1)
+    torch.testing.assert_close(path - goal, share * (x - goal).unsqueeze(1), rtol=0, atol=1e-12)
+    assert (dynamics.lyapunov(path).diff(dim=-1) < 0).all()
+    solved = solve_ivp(
+        lambda _, x: dynamics(torch.from_numpy(x).view(6, dim), torch.zeros(6, dim)).reshape(-1).numpy(),
+        (0, 1),
+        x.numpy().ravel(),
+        "LSODA",
+        times.numpy(),
+        rtol=1e-9,
+        atol=1e-12,
+    )
+    assert np.abs(solved.y.T.reshape(5, 6, dim).swapaxes(0, 1) - path.numpy()).max() < 1e-6
+    assert (dynamics(goal, goal) == 0).all()
+    torch.testing.assert_close(dynamics.flow(goal, times), goal.expand(5, dim), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("value", [0, -1.0, float("nan"), float("inf"), "long", None])
+def test_bad_duration(value):
+    with pytest.raises(ValueError, match=r"duration: expected a (finite )?number > 0"):
+        ChebyshevLaw(value)
+    with pytest.raises(ValueError, match=r"duration: expected a (finite )?number > 0"):
+        PiecewiseLinearLaw.uniform(value)
+
+
+@pytest.mark.parametrize(
+    ("knots", "speeds", "name"),
+    [
+        ([], [], "knots"),
+        ([0.0, 1.0], [1.0, 1.0], "knots"),
+        ([0.5, 0.5], [1.0, 1.0], "knots"),
+        ([0.5, float("nan")], [1.0, 1.0], "knots"),
+        ([0.5, float("inf")], [1.0, 1.0], "knots"),
+        ([0.1, 0.5], [1.0], "speeds"),
+        ([0.1, 0.5], [1.0, 0.0], "speeds"),
+        ([0.1, 0.5], [1.0, float("inf")], "speeds"),
+    ],
+)
+def test_bad_knots(knots, speeds, name):
+    with pytest.raises(ValueError, match=f"{name}: expected"):
+        PiecewiseLinearLaw(knots, speeds)
