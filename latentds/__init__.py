@@ -5,6 +5,7 @@ from .base import FitReport, LatentDS, StableDS
 from .chebyshev import ChebyshevDS
 from .demonstration import Demonstration
 from .diffeomorphism import Diffeomorphism, LocallyWeightedTranslations
+from .kernels import warmup
 
 __version__ = "0.1.0"
 __all__ = [
@@ -16,4 +17,5 @@ __all__ = [
     "LocallyWeightedTranslations",
     "StableDS",
     "datasets",
+    "warmup",
 ]
