@@ -6,13 +6,14 @@ import math
 from abc import ABC, abstractmethod
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from .arguments import positive
 
 TAIL = 1e-3
-"""Progress below which every law turns linear, ṡ ∝ -s: one that reaches the goal in finite time is not Lipschitz there."""
+"""Progress below which laws turn linear, ṡ ∝ -s: one that reaches the goal in finite time is not Lipschitz there."""
 
 
 class TimeLaw(nn.Module, ABC):
@@ -167,13 +168,6 @@ class PiecewiseLinearLaw(TimeLaw):
                 return
             self.knots, self.speeds = self.knots.new_empty(knots.shape), self.speeds.new_empty(speeds.shape)
         super()._load_from_state_dict(state_dict, prefix, *rest)
-
-    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any, **kwargs: Any) -> None:
-        for name in ("knots", "speeds"):  # a fit chooses how many
-            stored = state_dict.get(prefix + name)
-            if isinstance(stored, Tensor) and stored.ndim == 1:
-                setattr(self, name, getattr(self, name).new_ones(stored.shape))
-        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
     def _arrivals(self) -> Tensor:
         """Seconds from each knot to the first one, (m,)."""
