@@ -1,4 +1,4 @@
-"""What every public entry point asks of its arguments: a ValueError names the argument, what was expected, what came."""
+"""What every public entry point asks of its arguments: a ValueError says which, what was expected and what came."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from torch import Tensor
 
 
 def whole_number(value: Any, name: str, *, at_least: int) -> int:
-    if isinstance(value, bool) or not hasattr(value, "__index__") or (number := value.__index__()) < at_least:
+    if isinstance(value, bool) or not hasattr(value, "__index__") or value.__index__() < at_least:
         raise ValueError(f"{name}: expected a whole number >= {at_least}, got {value!r}")
-    return number
+    return int(value.__index__())
 
 
 def number_in(value: Any, name: str, low: float, high: float, *, ends: str = "()") -> float:
@@ -29,14 +29,27 @@ def number_in(value: Any, name: str, low: float, high: float, *, ends: str = "()
     return number
 
 
-def real_array(values: Any, name: str) -> np.ndarray:
-    if isinstance(values, Tensor):
-        values = values.detach().cpu().numpy() if values.dtype != torch.bfloat16 else values.detach().cpu().float().numpy()
+def real_tensor(values: Any, name: str) -> Tensor:
+    """``values`` as a tensor of whatever real dtype and device they have; never a copy of a tensor."""
     try:
+        tensor = torch.as_tensor(values)
+        if tensor.is_complex() or tensor.dtype == torch.bool:
+            raise TypeError
+    except (TypeError, ValueError, RuntimeError):
+        raise ValueError(f"{name}: expected an array of real numbers, got {_describe(values)}") from None
+    return tensor
+
+
+def real_array(values: Any, name: str) -> np.ndarray:
+    """``values`` as a float64 array of its own."""
+    try:
+        if isinstance(values, Tensor):
+            values = values.detach().cpu()
+            values = (values.float() if values.dtype == torch.bfloat16 else values).numpy()
         array = np.asarray(values)
         if array.dtype.kind not in "fiu":
             raise TypeError
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, RuntimeError):
         raise ValueError(f"{name}: expected an array of real numbers, got {_describe(values)}") from None
     return np.array(array, dtype=np.float64)
 

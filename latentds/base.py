@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
-from .arguments import whole_number
+from .arguments import real_tensor, whole_number
 from .demonstration import Demonstration
 from .diffeomorphism import Diffeomorphism
 from .time_law import LatentDynamics
@@ -81,7 +81,7 @@ class StableDS(nn.Module, ABC):
 
     def _points(self, y: Any, name: str = "y") -> tuple[Tensor, torch.dtype]:
         """``y`` in the module's dtype, and the dtype in which the caller wants the answer."""
-        points = y if isinstance(y, Tensor) else torch.as_tensor(y)
+        points = real_tensor(y, name)
         if points.ndim == 0 or points.shape[-1] != self.dim:
             raise ValueError(f"{name}: expected shape (..., {self.dim}), got {tuple(points.shape)}")
         dtype = self.attractor.dtype
@@ -90,7 +90,7 @@ class StableDS(nn.Module, ABC):
 
     def _times(self, t: Any) -> Tensor:
         """``t`` as seconds since its first entry, in the module's dtype."""
-        times = torch.as_tensor(t, device=self.attractor.device)
+        times = real_tensor(t, "t").to(self.attractor.device)
         if times.ndim != 1 or len(times) == 0:
             raise ValueError(f"t: expected shape (T,) with T >= 1, got {tuple(times.shape)}")
         times = times.to(torch.float64)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import os
-import tempfile
+import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from .arguments import point_array, positive, real_array
+
+MAX_BYTES = 2**30
+"""Largest file of a demonstration that is read, unpacked: a hostile one could name any size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +46,12 @@ class Demonstration:
             raise ValueError(f"name: expected a string, got {type(self.name).__name__}")
         object.__setattr__(self, "positions", torch.from_numpy(positions))
         object.__setattr__(self, "dt", dt)
-        velocities = np.gradient(positions, dt, axis=0, edge_order=2)
+        with np.errstate(over="ignore", invalid="ignore"):
+            velocities = np.gradient(positions, dt, axis=0, edge_order=2)
+        if not np.isfinite(velocities).all():
+            raise ValueError(
+                f"positions: expected a motion whose velocities are finite numbers, got steps too far for dt {dt:g}"
+            )
         object.__setattr__(self, "velocities", torch.from_numpy(velocities))
 
     def __repr__(self) -> str:
@@ -130,7 +138,10 @@ class Demonstration:
     @classmethod
     def _from_npz(cls, path: Path) -> Demonstration:
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+                size = sum(entry.file_size for entry in file.zip.infolist())  # unpacked
+                if size > MAX_BYTES:
+                    raise ValueError(f"holds {size:g} bytes, more than {MAX_BYTES:g}")
                 arrays = {key: file[key] for key in file.files if key in ("positions", "dt", "times", "name")}
         except Exception as error:
             raise ValueError(f"path: {path.name} is not a readable .npz without pickles ({error})") from None
@@ -148,13 +159,17 @@ class Demonstration:
     @classmethod
     def _from_csv(cls, path: Path) -> Demonstration:
         try:
-            with path.open(encoding="utf-8") as file:
-                header = file.readline().strip().split(",")
-                table = np.loadtxt(file, delimiter=",", ndmin=2)
+            if (size := path.stat().st_size) > MAX_BYTES:
+                raise ValueError(f"holds {size:g} bytes, more than {MAX_BYTES:g}")
+            header, *rows = path.read_text(encoding="utf-8").splitlines() or [""]
+            columns = header.split(",")
+            table = np.loadtxt(rows, delimiter=",", ndmin=2) if rows else np.empty((0, len(columns)))
         except (ValueError, UnicodeDecodeError) as error:
             raise ValueError(f"path: {path.name} is not a table of numbers under one header line ({error})") from None
-        if header[0] != "t" or len(header) < 2 or (table.size and table.shape[1] != len(header)):
-            raise ValueError(f"path: expected a first column 't' and one more per dimension in {path.name}, got {header}")
+        if columns[0] != "t" or len(columns) < 2 or table.shape[1] != len(columns):
+            raise ValueError(
+                f"path: expected a first column 't' and one more per dimension in {path.name}, got {columns}"
+            )
         return cls.from_times(table[:, 0], table[:, 1:], path.stem)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -177,8 +192,9 @@ class atomic_write:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
 
-    def __enter__(self) -> Any:
-        self.file = tempfile.NamedTemporaryFile(dir=self.path.parent, prefix=f".{self.path.name}.", delete=False)
+    def __enter__(self) -> IO[bytes]:
+        # Not by tempfile, whose files nobody else may read even after they took their place.
+        self.file = open(self.path.with_name(f".{self.path.name}.{secrets.token_hex(8)}"), "xb")
         return self.file
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

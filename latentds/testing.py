@@ -13,6 +13,7 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
+from .arguments import whole_number
 from .base import FitReport, LatentDS, StableDS
 from .demonstration import Demonstration
 
@@ -53,6 +54,7 @@ def check_stable_ds(
 
 def wavy_motion(dim: int, seed: int = 0, n_points: int = 200) -> Demonstration:
     """A smooth motion of about unit size that never meets itself, in any dimension, for trying methods out."""
+    dim = whole_number(dim, "dim", at_least=1)
     draw = np.random.default_rng(seed)
     t = np.linspace(0, 1, n_points)
     s = t - 0.8 * np.sin(2 * np.pi * t) / (2 * np.pi)
