@@ -1,0 +1,215 @@
+"""Pictures of motions and scores. Every function returns a matplotlib Figure and leaves the backend alone.
+
+Save one with ``figure.savefig("name.png")``. A method has the same colour in every picture. ``paths`` is always
+{label: (B, T, n) rollouts}, over the demonstration's duration; NaN in them leaves a gap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+from zlib import crc32
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from .arguments import real_array
+from .base import StableDS
+from .demonstration import Demonstration
+
+try:
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, MaxNLocator
+except ImportError as error:
+    raise ImportError("plotting needs matplotlib: pip install 'latentds[studies]'") from error
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+
+# Okabe and Ito's palette, told apart by colour-blind readers.
+COLORS = {"Chebyshev": "#0072B2", "FDM": "#D55E00", "SDS-EF": "#009E73", "TubeDS": "#CC79A7"}
+OTHERS = ("#56B4E9", "#E69F00", "#882255", "#999933")
+SHOWN = "#222222"
+DPI = 150
+
+
+def color_of(label: str) -> str:
+    """The colour of a method, by its label alone."""
+    return COLORS.get(label, OTHERS[crc32(label.encode()) % len(OTHERS)])
+
+
+def replications(demonstration: Demonstration, paths: Mapping[str, Any], title: str = "") -> Figure:
+    """The demonstration, and beside it a panel per method with its rollouts; n = 2 or 3.
+
+    Raises:
+        ValueError: for another n, or paths that do not fit the demonstration.
+    """
+    if demonstration.dim not in (2, 3):
+        raise ValueError(f"demonstration: expected 2 or 3 dimensions, got {demonstration.dim}; see joints")
+    moved = _moved(paths, demonstration)
+    low, high = _box(demonstration, moved)
+    figure = Figure(figsize=(3.3 * (len(moved) + 1), 3.9), dpi=DPI, layout="constrained")
+    figure.suptitle(title or demonstration.name, fontweight="bold")
+    solid = {"projection": "3d"} if demonstration.dim == 3 else {}
+    for i, (label, batch) in enumerate({"demonstration": None, **moved}.items()):
+        axes = figure.add_subplot(1, len(moved) + 1, i + 1, **solid)
+        for path in () if batch is None else batch:
+            inside = np.where(((path >= low) & (path <= high)).all(axis=1, keepdims=True), path, np.nan)
+            axes.plot(*inside.T, color=color_of(label), lw=0.8, alpha=0.55)
+        shown = demonstration.positions.numpy()
+        axes.plot(*shown.T, color=SHOWN, lw=1.6 if batch is None else 0.9, ls="-" if batch is None else "--")
+        starts = shown[:1] if batch is None else batch[:, 0]
+        axes.plot(*starts.T, "o", color=SHOWN, ms=3.5 if batch is None else 2.2, label="start")
+        axes.plot(*shown[-1:].T, "*", color="#E69F00", mec=SHOWN, mew=0.6, ms=11, label="goal")
+        axes.set_title(label, color=SHOWN if batch is None else color_of(label), fontsize=11)
+        for axis, bounds in zip("xyz", zip(low, high, strict=True), strict=False):
+            axes.set(**{f"{axis}lim": bounds, f"{axis}label": axis})
+            getattr(axes, f"{axis}axis").set_major_locator(MaxNLocator(4, prune="both"))
+        _quiet(axes)
+        if batch is None:
+            figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+    return figure
+
+
+def vector_field(
+    ds: StableDS, demonstration: Demonstration, paths: Any = None, label: str = "rollouts", margin: float = 0.35
+) -> Figure:
+    """Streamlines of a planar system with the demonstration and rollouts (B, T, 2) over them.
+
+    Args:
+        ds: of dimension 2.
+        demonstration: of dimension 2.
+        paths: (B, T, 2), or None to draw none.
+        label: the method's name.
+        margin: >= 0, of the picture around the demonstration, as a share of its size.
+
+    Raises:
+        ValueError: for another n, or paths that do not fit the demonstration.
+    """
+    if ds.dim != 2 or demonstration.dim != 2:
+        raise ValueError(f"ds: expected a system and a demonstration in 2-D, got {ds.dim}-D and {demonstration.dim}-D")
+    moved = {} if paths is None else _moved({label: paths}, demonstration)
+    shown = demonstration.positions.numpy()
+    border = margin * demonstration.size
+    (left, bottom), (right, top) = shown.min(axis=0) - border, shown.max(axis=0) + border
+    x, y = np.linspace(left, right, 60), np.linspace(bottom, top, 60)
+    with torch.no_grad():
+        velocity = ds(torch.from_numpy(np.stack(np.meshgrid(x, y), axis=-1))).numpy()
+    figure = Figure(figsize=(5.6, 5.6), dpi=DPI, layout="constrained")
+    axes = figure.add_subplot()
+    axes.streamplot(
+        x, y, velocity[..., 0], velocity[..., 1], color="#AAAAAA", linewidth=0.7, arrowsize=0.8, density=1.6
+    )
+    for batch in moved.values():
+        for i, path in enumerate(batch):
+            axes.plot(*path.T, color=color_of(label), lw=1.2, alpha=0.7, label="" if i else label)
+        axes.plot(*batch[:, 0].T, "o", color=color_of(label), ms=3)
+    axes.plot(*shown.T, color=SHOWN, lw=2, ls="--", label="demonstration")
+    axes.plot(*shown[0], "o", color=SHOWN, ms=6, label="start")
+    axes.plot(*shown[-1], "*", color="#E69F00", mec=SHOWN, ms=15, label="goal")
+    axes.set(xlim=(left, right), ylim=(bottom, top), xlabel="x", ylabel="y", title=demonstration.name)
+    axes.set_aspect("equal")
+    figure.legend(loc="outside lower center", ncols=4, fontsize=9, frameon=False)
+    return figure
+
+
+def dtw_bars(rows: pd.DataFrame, title: str = "") -> Figure:
+    """Mean exact DTW over the perturbed starts, with standard deviation and every start as a dot; log scale.
+
+    Args:
+        rows: of :func:`latentds.benchmark.compare`; methods and demonstrations keep their order.
+    """
+    scored = rows[rows["start"] > 0] if (rows["start"] > 0).any() else rows
+    methods, motions = (list(scored[column].unique()) for column in ("method", "demonstration"))
+    figure = Figure(figsize=(2.5 + 1.25 * len(motions), 4.2), dpi=DPI, layout="constrained")
+    axes = figure.add_subplot()
+    width = 0.82 / len(methods)
+    groups = scored.groupby(["method", "demonstration"])["dtw"]
+    for i, method in enumerate(methods):
+        place = np.arange(len(motions)) + (i - (len(methods) - 1) / 2) * width
+        scores = [groups.get_group((method, motion)).dropna().to_numpy() for motion in motions]
+        means = np.array([s.mean() if len(s) else np.nan for s in scores])
+        spread = np.array([s.std(ddof=1) if len(s) > 1 else 0.0 for s in scores])
+        axes.bar(place, means, 0.92 * width, color=color_of(method), alpha=0.8, label=method)
+        # On a log scale mean - sd may lie below zero: the whisker then ends at the smallest score.
+        lowest = np.array([s.min() if len(s) else np.nan for s in scores])
+        down = means - np.maximum(means - spread, np.minimum(lowest, means))
+        axes.errorbar(place, means, [down, spread], fmt="none", ecolor=SHOWN, elinewidth=1.1, capsize=3)
+        for x, s in zip(place, scores, strict=True):
+            axes.plot(x + np.linspace(-0.3, 0.3, len(s)) * width, s, ".", color=SHOWN, ms=2.5, alpha=0.35)
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter("")
+    axes.set_xticks(np.arange(len(motions)), motions)
+    axes.set(ylabel="exact DTW, sum over the path", title=title)
+    axes.grid(axis="y", color="#DDDDDD", lw=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(loc="outside lower center", ncols=len(methods), fontsize=9, frameon=False)
+    return figure
+
+
+def joints(demonstration: Demonstration, paths: Mapping[str, Any], title: str = "", unit: str = "rad") -> Figure:
+    """Every coordinate over time, one row each: the demonstration and the rollouts of each method; any n.
+
+    Raises:
+        ValueError: if paths do not fit the demonstration.
+    """
+    moved = _moved(paths, demonstration)
+    figure = Figure(figsize=(7.5, 1.0 + 1.25 * demonstration.dim), dpi=DPI, layout="constrained")
+    figure.suptitle(title or demonstration.name)
+    rows = figure.subplots(demonstration.dim, 1, sharex=True, squeeze=False)[:, 0]
+    for k, axes in enumerate(rows):
+        for label, batch in moved.items():
+            times = np.linspace(0, demonstration.duration, batch.shape[1])
+            for i, path in enumerate(batch):
+                name = label if k == i == 0 else ""
+                axes.plot(times, path[:, k], color=color_of(label), lw=0.9, alpha=0.6, label=name)
+        name = "" if k else "demonstration"
+        shown = demonstration.positions[:, k].numpy()
+        axes.plot(demonstration.times.numpy(), shown, color=SHOWN, lw=1.5, ls="--", label=name)
+        axes.set_ylabel(f"$y_{{{k + 1}}}$ [{unit}]")
+        axes.grid(color="#EEEEEE", lw=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+    rows[-1].set_xlabel("time [s]")
+    figure.legend(loc="outside lower center", ncols=len(moved) + 1, fontsize=9, frameon=False)
+    figure.align_ylabels(list(rows))
+    return figure
+
+
+def _moved(paths: Mapping[str, Any], demonstration: Demonstration) -> dict[str, Array]:
+    found = {label: real_array(batch, "paths") for label, batch in paths.items()}
+    for label, batch in found.items():
+        if batch.ndim != 3 or batch.shape[-1] != demonstration.dim:
+            raise ValueError(f"paths: expected (B, T, {demonstration.dim}) for {label!r}, got {batch.shape}")
+    return found
+
+
+def _box(demonstration: Demonstration, moved: Mapping[str, Array]) -> tuple[Array, Array]:
+    """A cube around the demonstration, up to 1.5 times its size where rollouts ask for it."""
+    shown = demonstration.positions.numpy()
+    middle = (shown.min(axis=0) + shown.max(axis=0)) / 2
+    wanted = [np.nanmax(np.abs(b - middle), initial=0.0, where=np.isfinite(b)) for b in moved.values()]
+    half = demonstration.size / 2 * 1.05
+    half = min(max([half, *wanted]), 1.5 * half)
+    return middle - half, middle + half
+
+
+def _quiet(axes: Any) -> None:
+    axes.tick_params(labelsize=7)
+    if hasattr(axes, "zaxis"):
+        axes.set_box_aspect((1, 1, 1), zoom=1.0)
+        axes.view_init(elev=22, azim=-58)
+        for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+            axis.set_pane_color((1, 1, 1, 0))
+            axis._axinfo["grid"].update(color="#E4E4E4", linewidth=0.5)
+        axes.tick_params(pad=-2)
+        for name in ("xaxis", "yaxis", "zaxis"):
+            getattr(axes, name).labelpad = -6
+    else:
+        axes.set_aspect("equal")
+        axes.spines[["top", "right"]].set_visible(False)
