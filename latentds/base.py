@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -14,6 +14,9 @@ from .arguments import real_tensor, whole_number
 from .demonstration import Demonstration
 from .diffeomorphism import Diffeomorphism
 from .time_law import LatentDynamics
+
+if TYPE_CHECKING:
+    from .controller import Controller
 
 Self = TypeVar("Self", bound="StableDS")
 
@@ -78,6 +81,12 @@ class StableDS(nn.Module, ABC):
 
         The state at ``t[0]`` is ``y0``: ``out[..., 0, :] == y0``.
         """
+
+    def controller(self) -> Controller:
+        """The velocity field as it is now for a real-time loop, NumPy in and out: see :class:`Controller`."""
+        from .controller import Controller
+
+        return Controller(self)
 
     def _points(self, y: Any, name: str = "y") -> tuple[Tensor, torch.dtype]:
         """``y`` in the module's dtype, and the dtype in which the caller wants the answer."""

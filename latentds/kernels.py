@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torch.autograd import forward_ad
 
 from .lanes import WIDTH, anywhere, either, load, power_of_two, store, where
+from .time_law import TAIL
 
 if TYPE_CHECKING:
     from .diffeomorphism import LocallyWeightedTranslations
@@ -275,6 +276,9 @@ def warmup(dims: Sequence[int] = (2, 3)) -> None:
             _unwind(dim, block)
             for tangents in {0, 1, dim}:
                 _sweep(dim, tangents, block)
+        steer(dim)
+    _pack()
+    greedy()
 
 
 # --- kernels ----------------------------------------------------------------------------------------------------------
@@ -302,6 +306,39 @@ def _exp(x: Any) -> Any:
     even = ((((_P10 * z + _P8) * z + _P6) * z + _P4) * z + _P2) * z + _P0
     odd = (((_P9 * z + _P7) * z + _P5) * z + _P3) * z + _P1
     return where(x > -650.0, (odd * r + even) * power_of_two(t), 0.0)
+
+
+@numba.njit(inline="always", **OPTIONS)  # type: ignore[untyped-decorator]
+def _first_root(b: Any, c: Any) -> Any:
+    """A Newton step from 0 towards the root s of s = exp(-(A s² - 2 B s + C)), held in [0, 1]."""
+    k = _exp(c * -1.0)
+    slope = 1.0 - 2.0 * k * b
+    s = where(slope > 0.3, k / slope, 3.0 * k)
+    return where(s > 1.0, 1.0, s)
+
+
+@numba.njit(inline="always", **OPTIONS)  # type: ignore[untyped-decorator]
+def _next_root(s: Any, low: Any, high: Any, a: Any, b: Any, c: Any) -> Any:
+    """A better s, its bracket, and whether yet another step would change it.
+
+    Halley's method, as two derivatives cost less than another exponential, inside a shrinking bracket. It is done
+    when a bound of the next step is lost in rounding.
+    """
+    g = b - a * s
+    exponent = (g + b) * s - c
+    k = _exp(where(exponent > 0.0, 0.0, exponent))
+    gap = s - k
+    slope = 1.0 - 2.0 * g * k
+    bend = (a - 2.0 * g * g) * k
+    low = where(gap < 0.0, s, low)
+    high = where(gap > 0.0, s, high)
+    new = s - gap * slope / (slope * slope - gap * bend)
+    outside = either(new < low, new > high)
+    new = where(outside, 0.5 * (low + high), new)
+    step = new - s
+    step = where(step < 0.0, -1.0 * step, step)
+    still = either(outside, step * step * step * (bend * bend + slope) > 2e-16 * new * slope * slope)
+    return new, low, high, still
 
 
 @cache
@@ -387,8 +424,8 @@ def _sweep(dim: int, tangents: int, block: int) -> Any:
 def _unwind(dim: int, block: int) -> Any:
     """ψ⁻¹ of points: (m, n) -> (m, n).
 
-    Each layer is one root of s = exp(-(A s² - 2 B s + C)) in [0, 1]: Halley's method (two derivatives cost less than
-    another exponential) inside a shrinking bracket, until the next step would be lost in rounding.
+    Each layer is one root of s = exp(-(A s² - 2 B s + C)) in [0, 1], A = ρ²‖v‖², B = ρ² v·(y-c), C = ρ²‖y-c‖². Vectors
+    of points whose roots are found drop out of the iteration.
     """
     width = WIDTH if block > 1 else 1
     at_b, at_s, at_low, at_high, at_x = (row * block for row in range(1, 6))
@@ -420,37 +457,28 @@ def _unwind(dim: int, block: int) -> Any:
                     n_near += anywhere(c < _BEYOND)
                 for i in range(n_near):
                     u = near[i]
-                    k = _exp(load(held, u, width) * -1.0)
-                    slope = 1.0 - 2.0 * k * load(held, at_b + u, width)
-                    s = where(slope > 0.3, k / slope, 3.0 * k)
-                    store(held, at_s + u, where(s > 1.0, 1.0, s))
-                    store(held, at_low + u, k * 0.0)
-                    store(held, at_high + u, k * 0.0 + 1.0)
+                    s = _first_root(load(held, at_b + u, width), load(held, u, width))
+                    store(held, at_s + u, s)
+                    store(held, at_low + u, s * 0.0)
+                    store(held, at_high + u, s * 0.0 + 1.0)
                 n_open = n_near
                 for _ in range(64):
                     n_left = 0
                     for i in range(n_open):
                         u = near[i]
-                        s, b = load(held, at_s + u, width), load(held, at_b + u, width)
-                        g = b - a * s
-                        exponent = (g + b) * s - load(held, u, width)
-                        k = _exp(where(exponent > 0.0, 0.0, exponent))
-                        gap = s - k
-                        slope = 1.0 - 2.0 * g * k
-                        bend = (a - 2.0 * g * g) * k
-                        low = where(gap < 0.0, s, load(held, at_low + u, width))
-                        high = where(gap > 0.0, s, load(held, at_high + u, width))
-                        new = s - gap * slope / (slope * slope - gap * bend)
-                        outside = either(new < low, new > high)
-                        new = where(outside, 0.5 * (low + high), new)
-                        step = new - s
-                        step = where(step < 0.0, -1.0 * step, step)
-                        left = step * step * step * (bend * bend + slope)  # times slope⁻², a bound of the next step
-                        store(held, at_s + u, new)
+                        s, low, high, still = _next_root(
+                            load(held, at_s + u, width),
+                            load(held, at_low + u, width),
+                            load(held, at_high + u, width),
+                            a,
+                            load(held, at_b + u, width),
+                            load(held, u, width),
+                        )
+                        store(held, at_s + u, s)
                         store(held, at_low + u, low)
                         store(held, at_high + u, high)
                         near[i], near[n_left] = near[n_left], u
-                        n_left += anywhere(either(outside, left > 2e-16 * new * slope * slope))
+                        n_left += anywhere(still)
                     n_open = n_left
                     if n_open == 0:
                         break
@@ -469,6 +497,84 @@ def _unwind(dim: int, block: int) -> Any:
 
 def _signature(n_arrays: int) -> str:
     return f"void({', '.join(['float64[:, ::1]'] * n_arrays)})"
+
+
+@cache
+def steer(dim: int) -> Any:
+    """The velocity J_ψ(x) g(x), x = ψ⁻¹(y), of points one by one: (m, n) -> (m, n); False if one is not finite.
+
+    ``goal`` (3, n) holds x*, the axis u and the length ℓ in each entry; with o = (x - x*)/ℓ, a = u·o and p = o - a u,
+    g = -ℓ (rate(|a|) a u + rate(|p|) p), the rates h(s)/s by the tables ``along`` and ``across``: (2, m) knots and
+    speeds, or the knot -1 and ω for the eigenmap's law. ``steps`` (M, n+1) is room to keep each layer's tangent map.
+    """
+
+    def steer(layers: Array, goal: Array, along: Array, across: Array, y: Array, out: Array, steps: Array) -> bool:
+        for row in range(len(y)):
+            velocity = out[row]
+            x = steps[len(layers)]
+            for d in range(dim):
+                if not np.isfinite(y[row, d]):
+                    return False
+                x[d] = y[row, d]
+            for j in range(len(layers) - 1, -1, -1):
+                q, a = layers[j, 2 * dim], layers[j, 2 * dim + 1]
+                b, c = 0.0, 0.0
+                for d in range(dim):
+                    w = x[d] - layers[j, d]
+                    c += w * w
+                    b += w * layers[j, dim + d]
+                steps[j, dim] = 0.0
+                if q * c > _BEYOND:
+                    continue
+                b, c = q * b, q * c
+                s, low, high = _first_root(b, c), 0.0, 1.0
+                for _ in range(64):
+                    s, low, high, still = _next_root(s, low, high, a, b, c)
+                    if not still:
+                        break
+                steps[j, dim] = -2.0 * q * s
+                for d in range(dim):
+                    x[d] -= s * layers[j, dim + d]
+                    steps[j, d] = x[d] - layers[j, d]
+            length = goal[2, 0]
+            ahead = 0.0
+            for d in range(dim):
+                x[d] = (x[d] - goal[0, d]) / length
+                ahead += x[d] * goal[1, d]
+            aside = 0.0
+            for d in range(dim):
+                x[d] -= ahead * goal[1, d]
+                aside += x[d] * x[d]
+            forward, inward = _rate(along, abs(ahead)) * ahead, _rate(across, np.sqrt(aside))
+            for d in range(dim):
+                velocity[d] = -length * (forward * goal[1, d] + inward * x[d])
+            for j in range(len(layers)):
+                if steps[j, dim] != 0.0:
+                    grown = 0.0
+                    for d in range(dim):
+                        grown += steps[j, d] * velocity[d]
+                    grown *= steps[j, dim]
+                    for d in range(dim):
+                        velocity[d] += grown * layers[j, dim + d]
+        return True
+
+    return compiled(steer, f"boolean({', '.join(['float64[:, ::1]'] * 7)})")
+
+
+@numba.njit(inline="always", **OPTIONS)  # type: ignore[untyped-decorator]
+def _rate(table: Array, s: Any) -> Any:
+    """h(s)/s of the laws in :mod:`latentds.time_law`."""
+    if table[0, 0] < 0.0:
+        s = max(s, TAIL)
+        return table[1, 0] * (np.sqrt((2.0 - s) / s) if s < 1.0 else 1.0 / s)
+    last = table.shape[1] - 1
+    if s <= table[0, 0]:
+        return table[1, 0] / table[0, 0]
+    if s >= table[0, last]:
+        return table[1, last] / s
+    i = np.searchsorted(table[0], s)
+    share = (s - table[0, i - 1]) / (table[0, i] - table[0, i - 1])
+    return (table[1, i - 1] + share * (table[1, i] - table[1, i - 1])) / s
 
 
 @cache
