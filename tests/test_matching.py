@@ -1,0 +1,187 @@
+"""Greedy matching against a plain loop that searches every width; the fits of ChebyshevDS and FDM against Table I."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import minimize_scalar
+
+from baselines import FDM
+from latentds import ChebyshevDS, Demonstration, datasets
+from latentds.diffeomorphism import WIDTH_BOUND
+from latentds.embedding import chebyshev_columns, place, straight_column
+from latentds.matching import match
+from latentds.testing import wavy_motion
+
+# Table I of the paper: complexity -> (beta, mu, layers, MSE per coordinate).
+TABLE_I = {
+    ChebyshevDS: {
+        1: (0.9, 0.6, 50, 7.38e-7),
+        3: (0.9, 0.8, 75, 5.73e-7),
+        7: (0.5, 0.9, 175, 7.26e-6),
+        10: (0.4, 0.9, 300, 9.51e-6),
+        15: (0.3, 0.8, 750, 1.62e-5),
+    },
+    FDM: {
+        1: (0.9, 0.8, 50, 2.52e-8),
+        3: (0.9, 0.9, 75, 9.64e-8),
+        7: (0.6, 0.9, 150, 3.35e-6),
+        10: (0.5, 0.9, 300, 5.39e-6),
+        15: (0.3, 0.8, 750, 1.56e-5),
+    },
+}
+
+
+def pair(shown, columns):
+    y = shown.positions.numpy()
+    return place(columns, y[0], y[-1]), y
+
+
+def cases():
+    for shown in (wavy_motion(1), wavy_motion(2), wavy_motion(7), datasets.unstable_spiral(3, 300)):
+        yield pytest.param(*pair(shown, straight_column(len(shown))), id=f"{shown.name}, straight")
+        yield pytest.param(*pair(shown, chebyshev_columns(len(shown), shown.dim)[::-1]), id=f"{shown.name}, Chebyshev")
+
+
+def moved_by(x, c, v, rho):
+    return x + np.exp(-(rho**2) * ((x - c) ** 2).sum(1))[:, None] * v
+
+
+def squared_error(x, y):
+    return ((y - x) ** 2).sum()
+
+
+def bounded(x, c, v, limit, y):
+    """What scipy's bounded scalar minimiser makes of one layer, as one would write the method first."""
+
+    def after(rho):
+        return squared_error(moved_by(x, c, v, rho), y)
+
+    return minimize_scalar(after, bounds=(0, limit), method="bounded").fun
+
+
+@pytest.mark.parametrize(("beta", "mu"), [(0.5, 0.9), (0.9, 0.6), (1.0, 0.99)])
+@pytest.mark.parametrize(("x", "y"), cases())
+def test_every_layer_is_the_best_greedy_one(x, y, beta, mu):
+    """Replayed by a plain loop: the centre is the worst point, it moves by β of its error, and no ρ is better."""
+    layers = match(x, y, 20, beta, mu)
+    assert len(layers.widths) == 20
+    size = np.ptp(y, axis=0).max()
+    for c, v, rho in zip(*layers, strict=True):
+        error = y - x
+        worst = (error**2).sum(1).argmax()
+        np.testing.assert_allclose(c, x[worst], rtol=0, atol=1e-9 * size)
+        np.testing.assert_allclose(v, beta * error[worst], rtol=1e-6, atol=1e-12 * size)
+        limit = mu * WIDTH_BOUND / np.linalg.norm(v)
+        assert 0 < rho <= limit * (1 + 1e-12)
+        after = moved_by(x, c, v, rho)
+        dense = min(squared_error(moved_by(x, c, v, r), y) for r in limit * np.geomspace(1e-4, 1, 1500))
+        assert squared_error(after, y) <= dense * (1 + 1e-6)
+        assert squared_error(after, y) <= bounded(x, c, v, limit, y) * (1 + 1e-9)
+        x = after
+
+
+@pytest.mark.parametrize("factor", [1e-9, 1e-3, 1e3, 1e9])
+def test_units_do_not_matter(factor):
+    x, y = pair(wavy_motion(3), straight_column(200))
+    plain, scaled = match(x, y, 20, 0.5, 0.9), match(factor * x, factor * y, 20, 0.5, 0.9)
+    np.testing.assert_allclose(scaled.centers, factor * plain.centers, rtol=1e-5, atol=1e-6 * factor)
+    np.testing.assert_allclose(scaled.directions, factor * plain.directions, rtol=1e-4, atol=1e-6 * factor)
+    np.testing.assert_allclose(scaled.widths * factor, plain.widths, rtol=1e-4)
+
+
+def test_perfect_match_needs_no_layer():
+    y = wavy_motion(2).positions.numpy()
+    assert len(match(y, y, 10, 0.5, 0.9).widths) == 0
+
+
+@pytest.mark.parametrize("c", [1, 3, 7, 10, 15])
+@pytest.mark.parametrize("method", TABLE_I, ids=lambda method: method.__name__)
+def test_table_1(method, c):
+    beta, mu, n_layers, reported = TABLE_I[method][c]
+    shown = datasets.unstable_spiral(c)
+    ds = method(3, n_layers=n_layers, beta=beta, mu=mu).fit(shown)
+    assert ds.fit_report.mse < 3 * reported
+    assert ds.fit_report.n_layers == n_layers
+    latent = chebyshev_columns(1000, 3)[::-1] if method is ChebyshevDS else straight_column(1000)
+    with torch.no_grad():
+        mapped = ds.decode(torch.from_numpy(place(latent, shown.start.numpy(), shown.goal.numpy())))
+    assert ds.fit_report.mse == pytest.approx((mapped - shown.positions).square().mean().item(), rel=1e-9)
+
+
+@pytest.mark.parametrize("method", TABLE_I, ids=lambda method: method.__name__)
+@pytest.mark.parametrize("dim", [1, 2, 3, 7])
+def test_attractor_is_the_end_of_the_demonstration(method, dim):
+    shown = wavy_motion(dim)
+    ds = method(dim, n_layers=40).fit(shown)
+    with torch.no_grad():
+        end = ds.rollout(shown.start, torch.tensor([0.0, 100 * shown.duration]))[-1]
+        assert (ds.attractor - shown.goal).abs().max() < 1e-9
+        assert (end - shown.goal).abs().max() < 1e-9
+        assert (ds.decode(ds.dynamics.attractor) - shown.goal).abs().max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        FDM,
+        pytest.param(
+            ChebyshevDS,
+            marks=pytest.mark.xfail(
+                strict=True,
+                reason="ψ is so badly conditioned at the goal that ψ⁻¹(y*) lies .6 from the latent line's end",
+            ),
+        ),
+    ],
+)
+def test_a_coordinate_at_rest_works(method):
+    """Start and goal coincide in it, or it never moves at all."""
+    t = torch.linspace(0, 1, 100, dtype=torch.float64)
+    shown = Demonstration(torch.stack([t, torch.sin(math.pi * t), torch.ones_like(t)], dim=1), 0.01)
+    ds = method(3, n_layers=40).fit(shown)
+    with torch.no_grad():
+        path = ds.rollout(shown.start, shown.times)
+    assert ds.fit_report.mse < 1e-4
+    assert torch.cdist(path, shown.positions).amin(1).max() < 0.1
+
+
+@pytest.mark.parametrize("method", TABLE_I, ids=lambda method: method.__name__)
+@pytest.mark.parametrize(
+    ("argument", "values"),
+    [
+        ("n_layers", [0, -1, 1.5, True, "many", None]),
+        ("beta", [0, -0.1, 1.001, math.nan, math.inf, "half", None]),
+        ("mu", [0, 1, 1.5, -1, math.nan, "most", None]),
+    ],
+)
+def test_hyperparameters_out_of_range(method, argument, values):
+    for value in values:
+        with pytest.raises(ValueError, match=f"{argument}: expected a (whole )?number .*, got"):
+            method(3, **{argument: value})
+    with pytest.raises(ValueError, match="dim: expected a whole number >= 1, got 0"):
+        method(0)
+
+
+@pytest.mark.parametrize("method", TABLE_I, ids=lambda method: method.__name__)
+def test_bad_demonstrations(method):
+    ds, shown = method(3, n_layers=5), wavy_motion(3)
+    t = torch.linspace(0, 2 * math.pi, 50, dtype=torch.float64)
+    loop = torch.stack([torch.cos(t), torch.sin(t), 0 * t], dim=1)
+    loop[-1] = loop[0]
+    bad = {
+        "expected dimension 3, got 2": wavy_motion(2),
+        "expected a goal apart from the start, got a closed loop": Demonstration(loop, 0.1),
+        "got list \\(empty\\)": [],
+        "learns from exactly one, got 2": [shown, shown],
+        "expected a Demonstration or a non-empty list of them, got Tensor": shown.positions,
+        "expected a Demonstration or a non-empty list of them, got NoneType": None,
+        "expected a Demonstration or a non-empty list of them, got list": [shown, 3],
+    }
+    for message, demonstration in bad.items():
+        with pytest.raises(ValueError, match=f"demonstration: .*{message}"):
+            ds.fit(demonstration)
+        assert ds.fit_report is None
+        assert bool((ds.attractor == 0).all())
