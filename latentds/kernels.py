@@ -109,14 +109,15 @@ class _Recomputed(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
-        *points, centers, log_widths, strengths = ctx.saved_tensors
-        twin: Any = object.__new__(type(ctx.module))
-        learned = dict(zip(_PARAMETERS, (centers, log_widths, strengths), strict=True))
-        twin.__dict__.update(ctx.module.__dict__, _parameters=learned)
         again = torch.is_grad_enabled()
         with torch.enable_grad(), reference():
+            # Views, so that the gradient for one input does not also flow through another made from it.
+            inputs = [tensor.view_as(tensor) for tensor in ctx.saved_tensors]
+            points, learned = inputs[: -len(_PARAMETERS)], inputs[-len(_PARAMETERS) :]
+            twin: Any = object.__new__(type(ctx.module))
+            twin.__dict__.update(ctx.module.__dict__, _parameters=dict(zip(_PARAMETERS, learned, strict=True)))
             value = ctx.torch_path(twin, *points)
-        asked = [t for t, needed in zip(ctx.saved_tensors, ctx.needs_input_grad[3:], strict=True) if needed]
+        asked = [tensor for tensor, needed in zip(inputs, ctx.needs_input_grad[3:], strict=True) if needed]
         found = iter(torch.autograd.grad(value, asked, gradient, create_graph=again, allow_unused=True))
         return None, None, None, *(next(found) if needed else None for needed in ctx.needs_input_grad[3:])
 
@@ -152,7 +153,7 @@ def linearize(module: LocallyWeightedTranslations, y: Tensor) -> tuple[Tensor, C
     def push(tangent: Tensor) -> Tensor:
         if not (_alone() and _plain(tangent, x.dtype)):
             return _pushed(module, x, tangent)
-        return _evaluate(_push, _pushed, module, x.expand_as(tangent), tangent.expand_as(x))
+        return _evaluate(_push, _pushed, module, *torch.broadcast_tensors(x, tangent))  # type: ignore[no-untyped-call]
 
     return x, push
 
@@ -309,6 +310,12 @@ def _exp(x: Any) -> Any:
 
 
 @numba.njit(inline="always", **OPTIONS)  # type: ignore[untyped-decorator]
+def _doubt(x: float) -> float:
+    """0, or NaN of NaN: a row with one is NaN in all coordinates, as on the torch path."""
+    return x if np.isnan(x) else 0.0
+
+
+@numba.njit(inline="always", **OPTIONS)  # type: ignore[untyped-decorator]
 def _first_root(b: Any, c: Any) -> Any:
     """A Newton step from 0 towards the root s of s = exp(-(A s² - 2 B s + C)), held in [0, 1]."""
     k = _exp(c * -1.0)
@@ -412,10 +419,13 @@ def _sweep(dim: int, tangents: int, block: int) -> Any:
                         place = (d + 1) * block + u
                         store(held, place, load(held, place, width) + k * layers[j, dim + d])
             for i in range(count):
+                doubt = 0.0  # or not a number, as soon as one coordinate is
                 for d in range(dim):
-                    x_out[begin + i, d] = held[(d + 1) * block + i]
+                    doubt += _doubt(held[(d + 1) * block + i])
+                for d in range(dim):
+                    x_out[begin + i, d] = held[(d + 1) * block + i] + doubt
                 for e in range(dim * tangents):
-                    t_out[begin + i, e] = held[first_tangent + e * block + i]
+                    t_out[begin + i, e] = held[first_tangent + e * block + i] + doubt
 
     return compiled(sweep, _signature(5))
 
@@ -489,8 +499,11 @@ def _unwind(dim: int, block: int) -> Any:
                         place = at_x + d * block + u
                         store(held, place, load(held, place, width) - s * layers[j, dim + d])
             for i in range(count):
+                doubt = 0.0
                 for d in range(dim):
-                    x_out[begin + i, d] = held[at_x + d * block + i]
+                    doubt += _doubt(held[at_x + d * block + i])
+                for d in range(dim):
+                    x_out[begin + i, d] = held[at_x + d * block + i] + doubt
 
     return compiled(unwind, _signature(3))
 
@@ -581,13 +594,13 @@ def _rate(table: Array, s: Any) -> Any:
 def greedy() -> Any:
     """The greedy match of :func:`latentds.matching.match`; moves ``moved`` in place.
 
-    (moved, y: (N, n); β, μ²e/2; layers (M, 2n+1) to fill with (c, v, ρ²)) -> layers filled. The loss of a layer,
-    ‖v‖² Σ k² - 2 a k with k = exp(-ρ²d) and a = error·v/‖v‖², is evaluated on a grid of ρ² with ratio √2 from the
-    bound down to where every k is near 1: doubling ρ² squares k, so the grid costs two exponentials a point. From the
-    best of the grid, Newton's method inside a bracket, with exact exponentials.
+    (moved, y: (N, n); β, μ²e/2, largest ρ²; layers (M, 2n+1) to fill with (c, v, ρ²)) -> layers filled. The loss of
+    a layer, ‖v‖² Σ k² - 2 a k with k = exp(-ρ²d) and a = error·v/‖v‖², is evaluated on a grid of ρ² with ratio √2
+    from the bound down to where every k is near 1: doubling ρ² squares k, so the grid costs two exponentials a point.
+    From the best of the grid, Newton's method inside a bracket, with exact exponentials.
     """
 
-    def greedy(moved: Array, y: Array, beta: float, bound: float, layers: Array) -> int:
+    def greedy(moved: Array, y: Array, beta: float, bound: float, narrowest: float, layers: Array) -> int:
         count, dim = moved.shape
         padded = (count + WIDTH - 1) // WIDTH * WIDTH
         x, error = np.zeros(dim * padded), np.zeros(dim * padded)
@@ -627,7 +640,7 @@ def greedy() -> Any:
             for i in range(count):
                 farthest = max(farthest, d[i])
             # The grid: two chains, q and q√2, doubled until q√2 reaches the bound.
-            limit = bound / size
+            limit = min(bound / size, narrowest)
             doublings = max(0, int(np.ceil(np.log2(max(16.0 * limit * farthest, 1.0)))))
             first = 0.5 * limit * 0.5**doublings
             for i in range(count, padded):
@@ -694,4 +707,4 @@ def greedy() -> Any:
                 moved[i, e] = x[e * padded + i]
         return used
 
-    return compiled(greedy, "int64(float64[:, ::1], float64[:, ::1], float64, float64, float64[:, ::1])")
+    return compiled(greedy, "int64(float64[:, ::1], float64[:, ::1], float64, float64, float64, float64[:, ::1])")

@@ -1,0 +1,381 @@
+"""The compiled path against the torch path: equal to rounding where it serves, and absent where it would be wrong."""
+
+from __future__ import annotations
+
+import copy
+import io
+import math
+import multiprocessing
+import os
+import pickle
+
+import numba
+import numpy as np
+import pytest
+import torch
+import torch.autograd.forward_ad as forward_ad
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from latentds import ChebyshevDS, LocallyWeightedTranslations, datasets, kernels, warmup
+from latentds.diffeomorphism import WIDTH_BOUND
+
+OPERATIONS = ("forward", "inverse", "jacobian")
+
+
+def random_map(dim, n_layers=40, dtype=torch.float64, seed=0):
+    """Layers as a fit leaves them: wide and strong ones, narrow and weak ones."""
+    draw = torch.Generator().manual_seed(seed)
+    psi = LocallyWeightedTranslations(dim, n_layers)
+    with torch.no_grad():
+        psi.centers.copy_(torch.randn(n_layers, dim, generator=draw))
+        psi.log_widths.copy_(torch.linspace(-1, 3, n_layers))
+        psi.strengths.copy_(0.3 * torch.randn(n_layers, dim, generator=draw))
+    return psi.to(dtype)
+
+
+def random_points(*shape, dtype=torch.float64, seed=1):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+
+
+def both(function):
+    """The value by the kernels and by torch."""
+    with torch.no_grad():
+        fast = function()
+        with kernels.reference():
+            return fast, function()
+
+
+def assert_equal(fast, slow, dtype=torch.float64):
+    assert fast.shape == slow.shape
+    assert fast.dtype == slow.dtype == dtype
+    if slow.numel():
+        limit = {torch.float64: 1e-12, torch.float32: 1e-5}[dtype]
+        assert (fast - slow).abs().max() <= limit * slow.abs().max()
+
+
+@pytest.mark.parametrize("operation", OPERATIONS)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("dim", [1, 2, 3, 7])
+def test_both_paths_agree(operation, dtype, dim):
+    psi, points = random_map(dim, dtype=dtype), random_points(300, dim, dtype=dtype)
+    assert kernels.serves(psi, points)
+    assert_equal(*both(lambda: getattr(psi, operation)(points)), dtype)
+
+
+@pytest.mark.parametrize("dim", [1, 3])
+def test_tangents_agree(dim):
+    psi, points, tangents = random_map(dim), random_points(300, dim), random_points(300, dim, seed=2)
+
+    def linearized():
+        x, push = psi.linearize(points)
+        return torch.stack([x, push(tangents), push(torch.ones(dim, dtype=torch.float64))])
+
+    fast, slow = both(linearized)
+    for one, other in zip(fast, slow, strict=True):
+        assert_equal(one, other)
+
+
+@pytest.mark.parametrize("operation", OPERATIONS)
+@pytest.mark.parametrize(
+    "points",
+    [
+        random_points(3),
+        random_points(0, 3),
+        random_points(2, 0, 3),
+        random_points(1, 3),
+        random_points(9, 3),
+        random_points(127, 3),
+        random_points(4, 1, 5, 3),
+        random_points(3, 20).T,
+        random_points(20, 6)[::2, ::2],
+        random_points(1, 3).expand(6, 3),
+    ],
+    ids=lambda points: f"{tuple(points.shape)}, strides {points.stride()}",
+)
+def test_any_shape_and_stride(operation, points):
+    psi = random_map(3)
+    before = points.clone()
+    fast, slow = both(lambda: getattr(psi, operation)(points))
+    assert_equal(fast, slow)
+    assert fast.is_contiguous()
+    assert torch.equal(points, before)
+
+
+def test_a_point_gets_the_same_answer_alone_and_in_a_crowd():
+    psi, points = random_map(3), random_points(200, 3)
+    with torch.no_grad():
+        alone = torch.stack([psi.inverse(point) for point in points])
+        assert_equal(alone, psi.inverse(points))
+
+
+def test_exponential():
+    x = np.concatenate([np.linspace(-649, 0, 5001), -np.geomspace(1e-300, 1, 200)])
+    value = np.array([kernels._exp(float(v)) for v in x])
+    assert np.abs(value / np.exp(x) - 1).max() < 2e-13  # |x| times the rounding of ln 2: weights below e^-60 do not act
+    near = x > -2
+    assert np.abs(value / np.exp(x) - 1)[near].max() < 6e-16
+    assert all(kernels._exp(v) == 0.0 for v in (-650.5, -746.0, -1e6, -1e300, -math.inf))
+
+
+@pytest.mark.parametrize("operation", OPERATIONS)
+def test_bad_rows_stay_alone(operation):
+    psi, points = random_map(3), random_points(50, 3)
+    with torch.no_grad():
+        clean = getattr(psi, operation)(points)
+        points[7, 1] = math.nan
+        points[20] = torch.tensor([math.inf, 0.0, -math.inf])
+        value = getattr(psi, operation)(points)
+    good = torch.ones(50, dtype=torch.bool)
+    good[[7, 20]] = False
+    assert torch.equal(value[good], clean[good])
+    assert value[7].isnan().all()
+    if operation != "jacobian":  # far from every layer nothing moves
+        assert torch.equal(value[20], points[20])
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 7])
+def test_inverse_never_fails(dim):
+    """25 000 layers a dimension up to a 1e-4 part from losing invertibility, at their centre, edge and surroundings."""
+    count, rng = 25_000, np.random.default_rng(dim)
+    mu = 1 - 10.0 ** rng.uniform(-4, 0, count)
+    widths = 10.0 ** rng.uniform(-3, 3, count)
+    direction = rng.standard_normal((count, dim))
+    direction *= (mu * WIDTH_BOUND / widths / np.linalg.norm(direction, axis=1))[:, None]
+    center = rng.standard_normal((count, dim))
+    layers = np.column_stack([center, direction, widths**2, (mu * WIDTH_BOUND) ** 2])
+    # the hardest points lie along v, where the slope of the layer falls to 1 - μ
+    along = rng.uniform(-1, 2, (count, 9, 1)) * direction[:, None]
+    points = center[:, None] + along + 0.3 * rng.standard_normal((count, 9, dim)) / widths[:, None, None]
+    points[:, 0], points[:, 1] = center, center + direction
+    crowd, alone = np.empty((9, dim)), np.empty((1, dim))
+    crowd_kernel, alone_kernel = kernels._unwind(dim, kernels.BLOCK), kernels._unwind(dim, 1)
+    for j in range(count):
+        y, layer = points[j], layers[j : j + 1]
+        crowd_kernel(layer, y, crowd)
+        alone_kernel(layer, y[:1], alone)
+        for x, target in ((crowd, y), (alone, y[:1])):
+            w = x - center[j]
+            back = x + np.exp(-layer[0, 2 * dim] * (w * w).sum(1))[:, None] * direction[j]
+            assert np.abs(back - target).max() <= 1e-14 * (np.abs(target).max() + np.abs(direction[j]).max())
+
+
+# --- derivatives ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("operation", OPERATIONS)
+def test_gradients_of_parameters_are_those_of_the_torch_path(operation):
+    psi, points = random_map(2, 6), random_points(5, 2)
+    parameters = tuple(psi.parameters())
+
+    def gradients():
+        value = getattr(psi, operation)(points)
+        first = torch.autograd.grad(value.square().sum(), parameters, create_graph=True)
+        second = torch.autograd.grad(sum(g.square().sum() for g in first), parameters)
+        return value, *first, *second
+
+    assert kernels.serves(psi, points)
+    fast = gradients()
+    assert "Recomputed" in type(fast[0].grad_fn).__name__
+    with kernels.reference():
+        slow = gradients()
+    for one, other in zip(fast, slow, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-11)
+
+
+def test_gradients_through_the_velocity():
+    ds = ChebyshevDS(2, n_layers=10).fit(datasets.archimedean_spiral(50))
+    points, parameters = 0.05 * random_points(5, 2), tuple(ds.parameters())
+    fast = torch.autograd.grad(ds(points).square().sum(), parameters)
+    with kernels.reference():
+        slow = torch.autograd.grad(ds(points).square().sum(), parameters)
+    for one, other in zip(fast, slow, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-12)
+
+
+def test_gradients_reach_parameters_that_were_swapped_in():
+    psi, other, points = random_map(2, 6), random_map(2, 6, seed=3), random_points(5, 2)
+    swapped = {name: torch.nn.Parameter(value.detach()) for name, value in other.named_parameters()}
+    value = torch.func.functional_call(psi, swapped, (points,))
+    found = torch.autograd.grad(value.sum(), list(swapped.values()))
+    with kernels.reference():
+        expected = torch.autograd.grad(other(points).sum(), list(other.parameters()))
+    for one, wanted in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, wanted)
+
+
+@pytest.mark.parametrize("operation", ["forward", "inverse"])
+def test_input_gradients_and_function_transforms(operation):
+    psi, points, tangents = random_map(2, 6), random_points(4, 2), random_points(4, 2, seed=2)
+    function = getattr(psi, operation)
+    with torch.no_grad():
+        expected = psi.jacobian(points if operation == "forward" else psi.inverse(points))
+        expected = expected if operation == "forward" else torch.linalg.inv(expected)
+    assert torch.autograd.gradcheck(function, points.clone().requires_grad_())
+    pushed = torch.einsum("bij,bj->bi", expected, tangents)
+    for parameters_learn in (True, False):
+        psi.requires_grad_(parameters_learn)
+        torch.testing.assert_close(torch.vmap(torch.func.jacrev(function))(points), expected)
+        torch.testing.assert_close(torch.vmap(torch.func.jacfwd(function))(points), expected)
+        torch.testing.assert_close(torch.func.jvp(function, (points,), (tangents,))[1], pushed)
+        with forward_ad.dual_level():
+            dual = function(forward_ad.make_dual(points, tangents))
+            torch.testing.assert_close(forward_ad.unpack_dual(dual).tangent, pushed)
+
+
+def test_transforms_of_a_tangent_map_made_outside_them():
+    psi, points, tangents = random_map(2, 6), random_points(4, 2), random_points(3, 4, 2, seed=2)
+    with torch.no_grad():
+        _, push = psi.linearize(points)
+        expected = torch.stack([push(t) for t in tangents])
+        torch.testing.assert_close(torch.vmap(push)(tangents), expected)
+        torch.testing.assert_close(torch.func.jvp(push, (tangents[0],), (tangents[1],))[1], expected[1])
+
+
+def test_the_rule():
+    psi, points = random_map(2), random_points(3, 2)
+    assert kernels.serves(psi, points)
+    assert not kernels.serves(psi, points.float())
+    assert not kernels.serves(psi, points.to("meta"))
+    assert not kernels.serves(psi, points.half())
+    assert not kernels.serves(psi, points.as_subclass(type("Marked", (torch.Tensor,), {})))
+    asked = points.clone().requires_grad_()
+    assert not kernels.serves(psi, asked)
+    with torch.no_grad():
+        assert kernels.serves(psi, asked)
+    with kernels.reference():
+        assert not kernels.serves(psi, points)
+    with FakeTensorMode():
+        assert not kernels.serves(psi, points)
+    with forward_ad.dual_level():
+        assert not kernels.serves(psi, points)
+    torch.nn.utils.parametrize.register_parametrization(psi, "centers", torch.nn.Identity())
+    assert not kernels.serves(psi, points)
+
+
+def test_traced_and_exported_programs_hold_torch_operations():
+    psi, points, other = random_map(2, 4).requires_grad_(False), random_points(3, 2), random_points(3, 2, seed=5)
+    traced = torch.fx.experimental.proxy_tensor.make_fx(lambda x: psi(x))(points)
+    exported = torch.export.export(psi, (points,)).module()
+    for program in (traced, exported):
+        torch.testing.assert_close(program(other), psi(other))
+
+
+# --- state ------------------------------------------------------------------------------------------------------------
+
+
+def changed_by_optimizer(psi):
+    optimizer = torch.optim.SGD(psi.parameters(), lr=0.1)
+    psi(random_points(4, 2)).square().sum().backward()
+    optimizer.step()
+
+
+def changed_by_data(psi):
+    psi.centers.data.mul_(1.5)
+
+
+def changed_by_loading(psi):
+    psi.load_state_dict(random_map(2, seed=9).state_dict())
+
+
+@pytest.mark.parametrize("change", [changed_by_optimizer, changed_by_data, changed_by_loading])
+def test_never_stale(change):
+    psi, points = random_map(2), random_points(20, 2)
+    before, _ = both(lambda: psi.inverse(points))
+    change(psi)
+    fast, slow = both(lambda: psi.inverse(points))
+    assert_equal(fast, slow)
+    assert not torch.equal(fast, before)
+
+
+@pytest.mark.parametrize(
+    "copied",
+    [copy.deepcopy, lambda psi: pickle.loads(pickle.dumps(psi)), lambda psi: psi.float().double()],
+    ids=["deepcopy", "pickle", "to"],
+)
+def test_copies_compute_the_same(copied):
+    psi, points = random_map(2, dtype=torch.float32).double(), random_points(20, 2)
+    with torch.no_grad():
+        expected = psi(points)
+        twin = copied(psi)
+        assert torch.equal(twin(points), expected)
+        torch.save(twin.state_dict(), io.BytesIO())
+
+
+# --- cores and compiling ----------------------------------------------------------------------------------------------
+
+
+def test_cores_share_the_rows(monkeypatch):
+    monkeypatch.setattr(kernels, "_available_cores", lambda: 3)
+    threads = torch.get_num_threads()
+    psi, points = random_map(3), random_points(20_000, 3)
+    try:
+        torch.set_num_threads(1)
+        with torch.no_grad():
+            alone = psi.jacobian(points)
+        torch.set_num_threads(3)
+        with torch.no_grad():
+            together = psi.jacobian(points)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(threads)
+    assert torch.equal(alone, together)
+
+
+def decoded(connection, psi, points):
+    with torch.no_grad():
+        connection.send(psi(points).numpy())
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_forked_processes_have_their_own_threads(monkeypatch):
+    monkeypatch.setattr(kernels, "_ALONE", 0)
+    psi, points = random_map(3), random_points(1000, 3)
+    with torch.no_grad():
+        expected = psi(points)
+    here, there = multiprocessing.Pipe()
+    child = multiprocessing.get_context("fork").Process(target=decoded, args=(there, psi, points))
+    child.start()
+    try:
+        assert here.poll(60)
+        np.testing.assert_array_equal(here.recv(), expected.numpy())
+    finally:
+        child.terminate()
+        child.join()
+
+
+def test_compiling_without_a_place_for_a_cache(monkeypatch, capsys):
+    def refusing(*args, cache=False, **options):
+        if cache:
+            raise RuntimeError("cannot cache function: no locator available")
+        return numba_njit(*args, **options)
+
+    numba_njit = numba.njit
+    monkeypatch.setattr(numba, "njit", refusing)
+
+    def twice(x):
+        return 2 * x
+
+    assert kernels.compiled(twice, "float64(float64)")(1.5) == 3.0
+
+
+def test_a_long_compilation_is_announced(monkeypatch, capsys):
+    ticks = iter([0.0, 5.0])
+    monkeypatch.setattr(kernels.time, "perf_counter", lambda: next(ticks))
+
+    def thrice(x):
+        return 3 * x
+
+    kernels.compiled(thrice, "float64(float64)")
+    assert capsys.readouterr().err == "latentds: compiled thrice for this CPU in 5.0 s\n"
+
+
+def test_warmup_compiles_everything(capsys):
+    warmup([2])
+    ds = ChebyshevDS(2, n_layers=5).fit(datasets.archimedean_spiral(50))
+    ds.controller()(np.zeros(2))
+    capsys.readouterr()
+    with torch.no_grad():
+        for points in (random_points(2), random_points(300, 2)):
+            ds(points), ds.jacobian(points)
+    assert capsys.readouterr().err == ""
