@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from .arguments import number_in
+from .arguments import number_in, whole_number
 from .base import LatentDS
 from .demonstration import Demonstration, only_demonstration
 from .diffeomorphism import LocallyWeightedTranslations
@@ -26,16 +26,27 @@ class ChebyshevDS(LatentDS):
         n_layers: M >= 1. The paper's Table I uses 50 to 750.
         beta: β in (0, 1], the share of the largest error that a layer moves.
         mu: μ in (0, 1), how near to its invertibility bound a layer may come.
+        steps: continuation steps of the matching; 1 is the paper's.
+        refined: whether all layers are moved together by L-BFGS after the greedy match; the paper's are not.
     """
 
-    def __init__(self, dim: int, *, n_layers: int = 150, beta: float = 0.5, mu: float = 0.9) -> None:
+    def __init__(
+        self,
+        dim: int,
+        *,
+        n_layers: int = 150,
+        beta: float = 0.5,
+        mu: float = 0.9,
+        steps: int = 1,
+        refined: bool = False,
+    ) -> None:
         super().__init__(dim, LocallyWeightedTranslations(dim, n_layers), RayDynamics(dim, ChebyshevLaw()))
         self.beta = number_in(beta, "beta", 0, 1, ends="(]")
         self.mu = number_in(mu, "mu", 0, 1)
+        self.steps = whole_number(steps, "steps", at_least=1)
+        self.refined = bool(refined)
 
-    def fit(
-        self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False
-    ) -> ChebyshevDS:
+    def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> ChebyshevDS:
         shown = only_demonstration(demonstration, self.dim, "ChebyshevDS")
         columns = chebyshev_columns(len(shown), self.dim)[::-1]
         latent = place(columns, shown.start.numpy(), shown.goal.numpy())

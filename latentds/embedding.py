@@ -17,8 +17,8 @@ def chebyshev_eigenvalues(n_points: int, dim: int) -> Array:
     """The smallest eigenvalue of each block H_j, j = 1 … n, of the graph Laplacian with K = n+1 copies: (n,).
 
     The graph is K copies of a path of N nodes whose last nodes form a K-cycle (paper, Sec. IV). Its Laplacian splits
-    into K tridiagonal blocks (paper, Prop. 2): diagonal 1, 2, …, 2, 3 - 2cos(2πj/K), off-diagonal -1. With λ = 2 - 2cos θ
-    the last row asks cos((N+½)θ) = (2cos(2πj/K) - 1) cos((N-½)θ), whose smallest root lies in (0, π/(2N-1)).
+    into K tridiagonal blocks (paper, Prop. 2): diagonal 1, 2, …, 2, 3 - 2cos(2πj/K), off-diagonal -1. With
+    λ = 2 - 2cos θ the last row asks cos((N+½)θ) = (2cos(2πj/K) - 1) cos((N-½)θ), whose smallest root lies in (0, π/(2N-1)).
 
     λN² → π²/4. Blocks j and K-j agree; for odd n the block j = K/2 stands alone, so "n repeating eigenvalues" (paper,
     Sec. IV-B) holds for even n only.
@@ -65,3 +65,37 @@ def _angles(n_points: int, dim: int) -> Array:
         return math.cos((n + 0.5) * theta) - (2 * math.cos(2 * math.pi * j / copies) - 1) * math.cos((n - 0.5) * theta)
 
     return np.array([brentq(last_row, 0, edge, args=(j,), xtol=1e-18, rtol=1e-15) for j in range(1, copies)])
+
+
+def arc_length_path(positions: Array, times: Array, n_points: int) -> tuple[Array, Array, Array]:
+    """The path evenly spaced in arc length, and when the motion was where along it.
+
+    Points nearer to the last kept one than the recording's noise (read off its second differences, between .05 % and
+    1 % of the motion's size) are dropped: at rest, jitter would pile up as path. A rest at the goal is cut off; other
+    rests stay as time spent between two points.
+
+    Args:
+        positions: (N, n), the last point the goal.
+        times: (N,) seconds, increasing from 0.
+        n_points: points of the path, >= 2.
+
+    Returns:
+        path (n_points, n) from start to goal; progress (m,), strictly decreasing from 1 to 0; its times (m,), strictly
+        increasing from 0.
+    """
+    size = float(np.ptp(positions, axis=0).max())
+    jitter = np.median(np.linalg.norm(np.diff(positions, 2, axis=0), axis=1)) / math.sqrt(6)
+    apart = float(np.clip(4 * jitter, 5e-4 * size, 1e-2 * size))
+    away = np.linalg.norm(positions - positions[-1], axis=1) > apart
+    last = min(int(np.flatnonzero(away)[-1]) + 1, len(positions) - 1) if away.any() else len(positions) - 1
+    kept = [0]
+    for i in range(1, last):
+        if np.linalg.norm(positions[i] - positions[kept[-1]]) > apart:
+            kept.append(i)
+    if len(kept) > 1 and np.linalg.norm(positions[-1] - positions[kept[-1]]) < apart / 2:
+        kept.pop()
+    points = np.concatenate([positions[kept], positions[-1:]])
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    even = np.linspace(0, arc[-1], n_points)
+    path = np.stack([np.interp(even, arc, column) for column in points.T], axis=1)
+    return path, 1 - arc / arc[-1], times[[*kept, last]] - times[0]

@@ -4,63 +4,76 @@ from __future__ import annotations
 
 import math
 import time
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from . import kernels
 from .base import FitReport, LatentDS
 from .demonstration import Demonstration
-from .diffeomorphism import WIDTH_BOUND, LocallyWeightedTranslations
+from .diffeomorphism import WIDTH_BOUND, Layers, LocallyWeightedTranslations
+from .isotopy import straight_isotopy
+from .refinement import refine
 from .time_law import RayDynamics, TimeLaw
 
 Array = NDArray[np.float64]
 
 
-class Layers(NamedTuple):
-    """Locally weighted translations x + exp(-ρ²‖x-c‖²) v, first to last."""
-
-    centers: Array
-    """(m, n)"""
-    directions: Array
-    """(m, n)"""
-    widths: Array
-    """(m,) ρ > 0"""
-
-
 def match(x: Array, y: Array, n_layers: int, beta: float, mu: float) -> Layers:
-    """Greedy matching of x to y, both (N, n) (Perrin and Schlehuber-Caissier 2016, Alg. 1)."""
-    n_points, dim = x.shape
-    moved = x.copy()
-    centers, directions, widths = [], [], []
-    for _ in range(n_layers):
-        error = y - moved
-        worst = int(np.argmax(np.einsum("ij,ij->i", error, error)))
-        c, v = moved[worst].copy(), beta * error[worst]
-        size = float(np.linalg.norm(v))
-        if not size > 0:
-            break
-        q = _best_square(((moved - c) ** 2).sum(1), error @ v, size**2, (mu * WIDTH_BOUND / size) ** 2)
-        moved = moved + np.exp(-q * ((moved - c) ** 2).sum(1))[:, None] * v
-        centers.append(c), directions.append(v), widths.append(math.sqrt(q))
-    return Layers(np.array(centers).reshape(-1, dim), np.array(directions).reshape(-1, dim), np.array(widths))
+    """Greedy matching of x to y, both (N, n) (Perrin and Schlehuber-Caissier 2016, Alg. 1).
+
+    Each layer moves the point with the largest error by ``beta`` of it, with the ρ below μ√(e/2)/‖v‖ that leaves the
+    least squared error over all points. Fewer than ``n_layers`` come back if no error is left.
+    """
+    return advance(x, y, n_layers, beta, mu)[0]
 
 
-def _best_square(distances: Array, along: Array, size: float, limit: float) -> float:
-    grid = limit * 2.0 ** -np.arange(0, 30, 0.5)
-    k = np.exp(-np.outer(grid, distances))
-    return float(grid[np.argmin((k * k * size - 2 * k * along).sum(1))])
+def advance(
+    moved: Array, y: Array, n_layers: int, beta: float, mu: float, narrowest: float = 0.0
+) -> tuple[Layers, Array]:
+    """Up to ``n_layers`` greedy layers on points where they stand, and where those layers move them: (N, n).
+
+    No layer is narrower, 1/ρ, than ``narrowest``.
+    """
+    dim = moved.shape[1]
+    moved = np.array(moved, dtype=np.float64, order="C")
+    rows = np.empty((n_layers, 2 * dim + 1))
+    limit = 1 / narrowest**2 if narrowest > 0 else math.inf
+    target = np.ascontiguousarray(y, dtype=np.float64)
+    used = kernels.greedy()(moved, target, beta, (mu * WIDTH_BOUND) ** 2, limit, rows)
+    return Layers(rows[:used, :dim], rows[:used, dim:-1], np.sqrt(rows[:used, -1])), moved
+
+
+def match_along(curves: Array, n_layers: int, beta: float, mu: float, narrowest: float = 0.0) -> Layers:
+    """Greedy matching of the first curve to the last by way of those between, (K+1, N, n).
+
+    Where the curve winds, matching x to y at once tangles strands; following intermediate curves does not
+    (continuation). Half of the layers are shared evenly by all K targets, the last takes the rest. With K = 1 this is
+    :func:`match`.
+    """
+    moved, targets = curves[0], curves[1:]
+    share, parts = n_layers // (2 * len(targets)), []
+    for target in targets[:-1]:
+        layers, moved = advance(moved, target, share, beta, mu, narrowest)
+        parts.append(layers)
+    left = n_layers - sum(len(layers.widths) for layers in parts)
+    parts.append(advance(moved, targets[-1], left, beta, mu, narrowest)[0])
+    return Layers(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 def settle(ds: LatentDS, latent: Array, shown: Demonstration, law: TimeLaw, *, progress: bool) -> None:
     """Fit ψ so that it maps ``latent`` (N, n) onto the demonstration, and lay the dynamics along it."""
     began = time.perf_counter()
     psi, dynamics = ds.diffeomorphism, ds.dynamics
-    assert isinstance(psi, LocallyWeightedTranslations) and isinstance(dynamics, RayDynamics)
+    assert isinstance(psi, LocallyWeightedTranslations)
+    assert isinstance(dynamics, RayDynamics)
     if bool((shown.start == shown.goal).all()):
         raise ValueError("demonstration: expected a goal apart from the start, got a closed loop")
-    layers = match(latent, shown.positions.numpy(), psi.n_layers, ds.beta, ds.mu)
+    points = shown.positions.numpy()
+    layers = match_along(straight_isotopy(latent, points, ds.steps), psi.n_layers, ds.beta, ds.mu)
+    if ds.refined:
+        layers = refine(layers, latent, points, ds.mu)
     psi.assign(*(torch.from_numpy(part) for part in layers))
     dynamics.law = law.to(ds.attractor)
     with torch.no_grad():

@@ -7,8 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from .diffeomorphism import WIDTH_BOUND
-from .matching import Layers
+from .diffeomorphism import WIDTH_BOUND, Layers
 
 Array = NDArray[np.float64]
 

@@ -35,6 +35,10 @@ class TimeLaw(nn.Module, ABC):
     def progress_at(self, time: Tensor) -> Tensor:
         """The inverse of :meth:`time_to_go`."""
 
+    @abstractmethod
+    def slowest_rate(self, reach: float) -> float:
+        """The least h(s)/s over 0 < s <= ``reach``, per second."""
+
 
 class ChebyshevLaw(TimeLaw):
     """h(s) = ω √(s(2-s)), ω = π / (2 duration): the latent motion of the Laplacian eigenmap (paper, Sec. V).
@@ -72,6 +76,9 @@ class ChebyshevLaw(TimeLaw):
         arc = 2 * torch.sin((phase.clamp(0.0, top) + self._edge) / 2).square()
         tail = TAIL * torch.exp(self._tail_rate * phase.clamp(max=0.0))
         return torch.where(phase < 0, tail, arc + (phase - top).clamp(min=0))
+
+    def slowest_rate(self, reach: float) -> float:
+        return float(self.speed(self.omega.new_tensor(reach))) / reach  # h(s)/s never rises
 
 
 class PiecewiseLinearLaw(TimeLaw):
@@ -157,6 +164,11 @@ class PiecewiseLinearLaw(TimeLaw):
         tail = self.knots[0] * torch.exp(self.speeds[0] / self.knots[0] * time.clamp(max=0.0))
         return torch.where(index == 0, tail, inside)
 
+    def slowest_rate(self, reach: float) -> float:
+        # h(s)/s is monotone between two knots
+        ends = torch.cat([self.knots[self.knots < reach], self.knots.new_tensor([reach])])
+        return float((self.speed(ends) / ends).min())
+
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         """A fit chooses how many knots there are, so a fresh law takes any number."""
         knots, speeds = state_dict.get(prefix + "knots"), state_dict.get(prefix + "speeds")
@@ -230,6 +242,10 @@ class LatentDynamics(nn.Module, ABC):
         """V = ‖x - x*‖²: (..., n) -> (...)."""
         return (x - self.attractor).square().sum(-1)
 
+    def slowest_rate(self, radius: float) -> float | None:
+        """A lower bound on -V̇/(2V) within ``radius`` of x*, per second, that holds by construction; None if unknown."""
+        return None
+
 
 class RayDynamics(LatentDynamics):
     """Straight to the goal: the direction of x - x* stays, its length over ``length`` follows ``law``.
@@ -257,6 +273,9 @@ class RayDynamics(LatentDynamics):
     def flow(self, x: Tensor, t: Tensor) -> Tensor:
         offset = (x - self.attractor).unsqueeze(-2)
         return self.attractor + _shrink(self.law, _off_zero(offset / self.length), t) * offset
+
+    def slowest_rate(self, radius: float) -> float:
+        return self.law.slowest_rate(radius / float(self.length))
 
 
 class TubeDynamics(LatentDynamics):
@@ -297,6 +316,10 @@ class TubeDynamics(LatentDynamics):
         along, across = (part.unsqueeze(-2) for part in self._split(x))
         left = _shrink(self.law, _off_zero(along), t) * along * self.axis
         return self.attractor + self.length * (left + _shrink(self.pull, _off_zero(across), t) * across)
+
+    def slowest_rate(self, radius: float) -> float:
+        reach = radius / float(self.length)
+        return min(self.law.slowest_rate(reach), self.pull.slowest_rate(reach))
 
     def _split(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Offset from x* in units of length: along the axis (..., 1) and across it (..., n)."""

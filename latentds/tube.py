@@ -1,0 +1,259 @@
+"""TubeDS, our own method: an arc-length line, continuation along the better isotopy, refinement, a contracting tube."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .arguments import number_in
+from .base import FitReport, LatentDS
+from .demonstration import Demonstration, demonstrations_of
+from .diffeomorphism import Layers, LocallyWeightedTranslations
+from .embedding import arc_length_path, place, straight_column
+from .isotopy import straight_isotopy, unbending_isotopy
+from .matching import match_along
+from .metrics import dtw
+from .refinement import refine
+from .time_law import PiecewiseLinearLaw, TubeDynamics
+
+Array = NDArray[np.float64]
+
+N_POINTS = 600
+"""Points, even in arc length, that ψ is matched on."""
+NARROWEST = 3.0
+"""Least width 1/ρ of a greedy layer, in distances between those points."""
+TUBE = 0.02
+"""Radius of the tube that the report speaks of, in lengths of the latent line."""
+NEAR = 0.05
+"""Distance from the demonstrated start, in sizes of the motion, of the starts that a match is also judged by."""
+FAR = 0.25
+"""Distance from the axis, in sizes of the motion, beyond which the inward pull stops growing."""
+
+
+@dataclass(frozen=True)
+class TubeReport(FitReport):
+    """What a fit of :class:`TubeDS` reached and what it costs.
+
+    Attributes:
+        isotopy: "straight" or "unbending", the one that was kept.
+        rollout_error: mean distance of the rollout from the demonstrated start to the demonstration at equal progress,
+            in sizes of the motion.
+        condition_path: largest cond(J_ψ) along the path.
+        condition_tube: the same within 0.02 latent lengths of it.
+        largest_velocity: largest ‖f‖ in that tube, in mean speeds of the demonstration.
+        largest_gradient: largest ‖∂f/∂y‖ (spectral) in that tube, per demonstration duration: what a controller must
+            follow; it grows with the contraction κ.
+        spread: standard deviation of several demonstrations about their mean path, per coordinate; zeros for one.
+    """
+
+    isotopy: str = ""
+    rollout_error: float = 0.0
+    condition_path: float = 1.0
+    condition_tube: float = 1.0
+    largest_velocity: float = 0.0
+    largest_gradient: float = 0.0
+    spread: tuple[float, ...] = ()
+
+
+class TubeDS(LatentDS):
+    """Stable motion that keeps to a contracting tube around the demonstration, with nothing to tune.
+
+    Points evenly spaced in arc length are matched to a straight line, so that ψ is near-isometric along the path; the
+    timing lives in the time law alone. Matching follows the straight or the unbending isotopy, whichever rolls out
+    better and is better conditioned, and is then refined jointly. Across the path the latent point is drawn in at
+    rate κ. The attractor is exact.
+
+    Several demonstrations of one motion are fitted by their mean path and timing (a common goal, aligned in time).
+
+    Args:
+        dim: n >= 1.
+        n_layers: M >= 1.
+        contraction: κ > 0, per duration of the demonstration: a start off the path comes back within about
+            3/κ of it. A larger κ costs proportionally larger velocity gradients (see the report).
+        refined: whether L-BFGS refines the match; without it a fit takes a tenth of the time.
+    """
+
+    def __init__(self, dim: int, *, n_layers: int = 300, contraction: float = 20.0, refined: bool = True) -> None:
+        along, across = PiecewiseLinearLaw.uniform(), PiecewiseLinearLaw(torch.ones(1), torch.ones(1))
+        super().__init__(dim, LocallyWeightedTranslations(dim, n_layers), TubeDynamics(dim, along, across))
+        self.contraction = number_in(contraction, "contraction", 0, float("inf"))
+        self.refined = bool(refined)
+
+    def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> TubeDS:
+        began = time.perf_counter()
+        shown, spread = mean_motion(demonstrations_of(demonstration, self.dim))
+        path, way, times = arc_length_path(shown.positions.numpy(), shown.times.numpy(), N_POINTS)
+        _refuse_crossings(path)
+        law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
+        best, lowest = None, math.inf
+        for candidate in _candidates(path, self.psi.n_layers):
+            self._lay(candidate, shown, law)
+            if (score := self._score(shown)) < lowest:
+                best, lowest = candidate, score
+        assert best is not None
+        if self.refined:
+            better = best.refined(path)
+            self._lay(better, shown, law)
+            best = better if self._score(shown) < lowest else best
+        self._lay(best, shown, law)
+        self.fit_report = self._report(best, path, shown, spread, began)
+        return self
+
+    @property
+    def psi(self) -> LocallyWeightedTranslations:
+        """The diffeomorphism, as what it is."""
+        assert isinstance(self.diffeomorphism, LocallyWeightedTranslations)
+        return self.diffeomorphism
+
+    @torch.no_grad()
+    def _lay(self, candidate: Candidate, shown: Demonstration, law: PiecewiseLinearLaw) -> None:
+        """Take a match, and lay the dynamics from the encoded start to the encoded goal."""
+        assert isinstance(self.dynamics, TubeDynamics)
+        self.psi.assign(*(torch.from_numpy(part) for part in candidate.layers))
+        self.attractor.copy_(shown.goal)
+        start = shown.start.to(self.attractor)
+        self.dynamics.aim(self.psi.inverse(start), self.psi.inverse(self.attractor))
+        far = torch.as_tensor(FAR * shown.size) / self.dynamics.length.cpu()
+        self.dynamics.law = law.to(self.attractor)
+        pull = PiecewiseLinearLaw(far.reshape(1), (far * self.contraction / shown.duration).reshape(1))
+        self.dynamics.pull = pull.to(self.attractor)
+
+    @torch.no_grad()
+    def _score(self, shown: Demonstration) -> float:
+        """How badly it rolls out from the demonstrated start and from NEAR around it, times the root of cond(J)."""
+        rows = np.linspace(0, len(shown) - 1, 200).round().astype(int)
+        motion = shown.positions[rows]
+        offsets = NEAR * shown.size * torch.eye(self.dim, dtype=motion.dtype)
+        starts = shown.start + torch.cat([torch.zeros_like(offsets[:1]), offsets, -offsets])
+        paths = self.rollout(starts, shown.times[rows])
+        if not bool(torch.isfinite(paths).all()):
+            return math.inf
+        misses = [dtw(path, motion) / len(rows) / shown.size for path in paths]
+        return (misses[0] + float(np.mean(misses[1:]))) * math.sqrt(self._condition(self._line()))
+
+    def _line(self, n_points: int = 150) -> Tensor:
+        """Latent points from the encoded start to x*, (n_points, n)."""
+        assert isinstance(self.dynamics, TubeDynamics)
+        share = torch.linspace(1, 0, n_points, dtype=self.attractor.dtype, device=self.attractor.device)
+        return self.dynamics.attractor + share.unsqueeze(-1) * self.dynamics.length * self.dynamics.axis
+
+    def _condition(self, line: Tensor) -> float:
+        return float(torch.linalg.cond(self.psi.jacobian(line)).max())
+
+    @torch.no_grad()
+    def _report(
+        self, best: Candidate, path: Array, shown: Demonstration, spread: tuple[float, ...], began: float
+    ) -> TubeReport:
+        assert isinstance(self.dynamics, TubeDynamics)
+        line = self._line()
+        across = torch.linalg.svd(self.dynamics.axis.unsqueeze(-1))[0][:, 1:].T * TUBE * self.dynamics.length
+        tube = torch.cat([line, *(line + side * offset for offset in across for side in (1, -1))])
+        missed = torch.linalg.vector_norm(self.psi(self._line(len(path))).cpu() - torch.from_numpy(path), dim=-1).mean()
+        y = self.psi(tube)
+        step = 1e-6 * shown.size
+        nudges = step * torch.eye(self.dim, dtype=y.dtype, device=y.device)
+        slopes = (self(y.unsqueeze(-2) + nudges) - self(y.unsqueeze(-2) - nudges)) / (2 * step)
+        length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+        return TubeReport(
+            mse=best.mse(path),
+            n_layers=self.psi.n_layers,
+            seconds=time.perf_counter() - began,
+            isotopy=best.isotopy,
+            rollout_error=float(missed) / shown.size,
+            condition_path=self._condition(line),
+            condition_tube=self._condition(tube),
+            largest_velocity=float(torch.linalg.vector_norm(self(y), dim=-1).max()) * shown.duration / length,
+            largest_gradient=float(torch.linalg.matrix_norm(slopes, 2).max()) * shown.duration,
+            spread=spread,
+        )
+
+
+class Candidate(NamedTuple):
+    """A match, and how it came about."""
+
+    isotopy: str
+    layers: Layers
+    line: Array
+    """(N, n) the latent points"""
+
+    def refined(self, path: Array) -> Candidate:
+        weights = np.ones(len(path))
+        weights[[0, -1]] = 0.05 * len(path)  # the start must encode to the start, the goal to the goal
+        return self._replace(layers=refine(self.layers, self.line, path, 0.95, weights=weights))
+
+    def mse(self, path: Array) -> float:
+        psi = LocallyWeightedTranslations(path.shape[1], len(self.layers.widths))
+        psi.assign(*(torch.from_numpy(part) for part in self.layers))
+        return float((psi(torch.from_numpy(self.line)) - torch.from_numpy(path)).square().mean())
+
+
+def _candidates(path: Array, n_layers: int) -> Iterator[Candidate]:
+    """Matches of a line to the path (N, n), along either isotopy."""
+    steps = max(1, min(20, n_layers // 10))
+    chord = place(straight_column(len(path)), path[0], path[-1])
+    middle = chord.mean(0)
+    # A layer narrower than the points are apart fits one of them and puts a spike into the velocity.
+    narrowest = NARROWEST * float(np.linalg.norm(path[1] - path[0]))
+    for stretch in (1.0, 2.0):
+        line = middle + stretch * (chord - middle)
+        yield Candidate(
+            "straight", match_along(straight_isotopy(line, path, steps), n_layers, 0.9, 0.9, narrowest), line
+        )
+    if path.shape[1] > 1:
+        curves = unbending_isotopy(path, steps)
+        for beta in (0.9, 0.5):
+            yield Candidate("unbending", match_along(curves, n_layers, beta, 0.9, narrowest), curves[0])
+
+
+def mean_motion(shown: Sequence[Demonstration]) -> tuple[Demonstration, tuple[float, ...]]:
+    """The mean of several demonstrations, aligned in time, with the mean goal; and their spread, per coordinate."""
+    if len(shown) == 1:
+        return shown[0], (0.0,) * shown[0].dim
+    count = max(len(one) for one in shown)
+    share = np.linspace(0, 1, count)
+    paths = np.stack(
+        [
+            np.stack([np.interp(share, np.linspace(0, 1, len(one)), c) for c in one.positions.numpy().T], 1)
+            for one in shown
+        ]
+    )
+    goal = paths[:, -1].mean(0)
+    paths += share[:, None] * (goal - paths[:, -1:])
+    duration = float(np.mean([one.duration for one in shown]))
+    mean = Demonstration(torch.from_numpy(paths.mean(0)), duration / (count - 1), f"mean of {len(shown)}")
+    return mean, tuple(float(value) for value in paths.std(0).mean(0))
+
+
+def _refuse_crossings(path: Array) -> None:
+    """Refuse a path that meets itself: an autonomous system has one velocity per point.
+
+    Stretches closer along the path than 2 % of it may touch: that is noise, not a crossing.
+    """
+    start, step = path[:-1], np.diff(path, axis=0)
+    count = len(step)
+    first, second = np.triu_indices(count, max(2, count // 50))
+    gap = start[first] - start[second]
+    # the closest points of two segments: clamp one, solve for the other, clamp, solve back
+    a, e = (step[first] ** 2).sum(1), (step[second] ** 2).sum(1)
+    b, c, f = (step[first] * step[second]).sum(1), (step[first] * gap).sum(1), (step[second] * gap).sum(1)
+    denominator = a * e - b * b
+    s = np.clip(np.where(denominator > 1e-12 * a * e, (b * f - c * e) / np.maximum(denominator, 1e-300), 0.0), 0, 1)
+    t = np.clip((b * s + f) / e, 0, 1)
+    s = np.clip((b * t - c) / a, 0, 1)
+    near = np.linalg.norm(gap + s[:, None] * step[first] - t[:, None] * step[second], axis=1)
+    worst = int(np.argmin(near))
+    if near[worst] < 1e-7 * np.ptp(path, axis=0).max():
+        where = np.array2string(start[first[worst]], precision=4)
+        raise ValueError(
+            f"demonstration: expected a path that does not meet itself, got one that comes back to {where} "
+            f"({first[worst] / count:.0%} and {(second[worst] + 1) / count:.0%} of the way); "
+            "an autonomous system has one velocity at each point"
+        )
