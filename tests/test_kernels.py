@@ -133,10 +133,10 @@ def test_bad_rows_stay_alone(operation):
         assert torch.equal(value[20], points[20])
 
 
-@pytest.mark.parametrize("dim", [1, 2, 3, 7])
+@pytest.mark.parametrize("dim", [2, 3, 7])
 def test_inverse_never_fails(dim):
-    """25 000 layers a dimension up to a 1e-4 part from losing invertibility, at their centre, edge and surroundings."""
-    count, rng = 25_000, np.random.default_rng(dim)
+    """35 000 layers a dimension up to a 1e-4 part from losing invertibility, at their centre, edge and surroundings."""
+    count, rng = 35_000, np.random.default_rng(dim)
     mu = 1 - 10.0 ** rng.uniform(-4, 0, count)
     widths = 10.0 ** rng.uniform(-3, 3, count)
     direction = rng.standard_normal((count, dim))
@@ -344,30 +344,21 @@ def test_forked_processes_have_their_own_threads(monkeypatch):
         child.join()
 
 
-def test_compiling_without_a_place_for_a_cache(monkeypatch, capsys):
+def test_compiling_where_no_cache_can_be_kept(monkeypatch, capsys):
     def refusing(*args, cache=False, **options):
         if cache:
             raise RuntimeError("cannot cache function: no locator available")
-        return numba_njit(*args, **options)
+        return njit(*args, **options)
 
-    numba_njit = numba.njit
+    njit, ticks = numba.njit, iter([0.0, 5.0])
     monkeypatch.setattr(numba, "njit", refusing)
+    monkeypatch.setattr(kernels.time, "perf_counter", lambda: next(ticks))
 
     def twice(x):
         return 2 * x
 
     assert kernels.compiled(twice, "float64(float64)")(1.5) == 3.0
-
-
-def test_a_long_compilation_is_announced(monkeypatch, capsys):
-    ticks = iter([0.0, 5.0])
-    monkeypatch.setattr(kernels.time, "perf_counter", lambda: next(ticks))
-
-    def thrice(x):
-        return 3 * x
-
-    kernels.compiled(thrice, "float64(float64)")
-    assert capsys.readouterr().err == "latentds: compiled thrice for this CPU in 5.0 s\n"
+    assert capsys.readouterr().err == "latentds: compiled twice for this CPU in 5.0 s\n"
 
 
 def test_warmup_compiles_everything(capsys):
