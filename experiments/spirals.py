@@ -133,8 +133,8 @@ def summarize(rows: pd.DataFrame, spirals: list[str], labels: list[str]) -> str:
     return "# Ten spirals\n\n" + "\n\n".join(parts) + "\n"
 
 
-NOTES = f"""Raw sums of Euclidean distances over 500 points; lower is better, **bold** the best. †: FastDTW and exact DTW
-differ by more than 5 %. p: {RIVALS[0]} against {RIVALS[1]} on the shared starts, paired t-test and Welch's."""
+NOTES = f"""Raw sums of Euclidean distances over 500 points; lower is better, **bold** the best. †: FastDTW differs from
+exact DTW by more than 5 %. p: {RIVALS[0]} against {RIVALS[1]} on the shared starts, paired t-test and Welch's."""
 
 
 def _scores(rows: pd.DataFrame, score: str, names: list[str], labels: list[str]) -> str:
@@ -190,7 +190,7 @@ def _failures(rows: pd.DataFrame) -> str:
 
 
 def draw(rows: pd.DataFrame, done: list[Outcome], shown: list[Demonstration], out: Path) -> None:
-    order = list(methods(shown[0].name, quick=False))
+    order = list(methods(shown[0].name, False))
     for demonstration in shown:
         first = {o.method: o.paths for o in reversed(done) if o.demonstration == demonstration.name}
         paths = {label: first[label] for label in order if label in first}

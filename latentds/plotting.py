@@ -6,6 +6,7 @@ Save one with ``figure.savefig("name.png")``. A method has the same colour in ev
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 from zlib import crc32
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .arguments import real_array
+from .arguments import number_in, real_array
 from .base import StableDS
 from .demonstration import Demonstration
 
@@ -44,6 +45,8 @@ def color_of(label: str) -> str:
 def replications(demonstration: Demonstration, paths: Mapping[str, Any], title: str = "") -> Figure:
     """The demonstration, and beside it a panel per method with its rollouts; n = 2 or 3.
 
+    Where rollouts leave the picture, a cube of up to 1.5 times the demonstration's size, the panel says how many.
+
     Raises:
         ValueError: for another n, or paths that do not fit the demonstration.
     """
@@ -54,23 +57,25 @@ def replications(demonstration: Demonstration, paths: Mapping[str, Any], title: 
     figure = Figure(figsize=(3.3 * (len(moved) + 1), 3.9), dpi=DPI, layout="constrained")
     figure.suptitle(title or demonstration.name, fontweight="bold")
     solid = {"projection": "3d"} if demonstration.dim == 3 else {}
-    for i, (label, batch) in enumerate({"demonstration": None, **moved}.items()):
+    nothing = np.empty((0, 1, demonstration.dim))
+    for i, (label, batch) in enumerate([("demonstration", nothing), *moved.items()]):
         axes = figure.add_subplot(1, len(moved) + 1, i + 1, **solid)
-        for path in () if batch is None else batch:
-            inside = np.where(((path >= low) & (path <= high)).all(axis=1, keepdims=True), path, np.nan)
-            axes.plot(*inside.T, color=color_of(label), lw=0.8, alpha=0.55)
+        inside = np.all((batch >= low) & (batch <= high), axis=2)
+        for path, seen in zip(batch, inside, strict=True):
+            axes.plot(*np.where(seen[:, None], path, np.nan).T, color=color_of(label), lw=0.8, alpha=0.55)
         shown = demonstration.positions.numpy()
-        axes.plot(*shown.T, color=SHOWN, lw=1.6 if batch is None else 0.9, ls="-" if batch is None else "--")
-        starts = shown[:1] if batch is None else batch[:, 0]
-        axes.plot(*starts.T, "o", color=SHOWN, ms=3.5 if batch is None else 2.2, label="start")
+        axes.plot(*shown.T, color=SHOWN, lw=0.9 if i else 1.6, ls="--" if i else "-")
+        starts = batch[:, 0] if i else shown[:1]
+        axes.plot(*starts.T, "o", color=SHOWN, ms=2.2 if i else 3.5, label="start")
         axes.plot(*shown[-1:].T, "*", color="#E69F00", mec=SHOWN, mew=0.6, ms=11, label="goal")
-        axes.set_title(label, color=SHOWN if batch is None else color_of(label), fontsize=11)
+        gone = int((~np.all(inside, axis=1)).sum())
+        note = f"\n{gone} of {len(batch)} leave the picture" if gone else ""
+        axes.set_title(label + note, color=color_of(label) if i else SHOWN, fontsize=11)
         for axis, bounds in zip("xyz", zip(low, high, strict=True), strict=False):
             axes.set(**{f"{axis}lim": bounds, f"{axis}label": axis})
             getattr(axes, f"{axis}axis").set_major_locator(MaxNLocator(4, prune="both"))
         _quiet(axes)
-        if batch is None:
-            figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
     return figure
 
 
@@ -91,6 +96,7 @@ def vector_field(
     """
     if ds.dim != 2 or demonstration.dim != 2:
         raise ValueError(f"ds: expected a system and a demonstration in 2-D, got {ds.dim}-D and {demonstration.dim}-D")
+    margin = number_in(margin, "margin", 0, math.inf, ends="[)")
     moved = {} if paths is None else _moved({label: paths}, demonstration)
     shown = demonstration.positions.numpy()
     border = margin * demonstration.size
@@ -121,7 +127,12 @@ def dtw_bars(rows: pd.DataFrame, title: str = "") -> Figure:
 
     Args:
         rows: of :func:`latentds.benchmark.compare`; methods and demonstrations keep their order.
+
+    Raises:
+        ValueError: if a column is missing.
     """
+    if missing := {"method", "demonstration", "start", "dtw"} - set(rows):
+        raise ValueError(f"rows: expected the columns of compare, got none named {sorted(missing)}")
     scored = rows[rows["start"] > 0] if (rows["start"] > 0).any() else rows
     methods, motions = (list(scored[column].unique()) for column in ("method", "demonstration"))
     figure = Figure(figsize=(2.5 + 1.25 * len(motions), 4.2), dpi=DPI, layout="constrained")
