@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -14,19 +16,24 @@ from latentds.base import FitReport, LatentDS
 from latentds.demonstration import Demonstration, demonstrations_of
 from latentds.diffeomorphism import AffineCouplings
 from latentds.time_law import LatentDynamics
-from latentds.training import Plan, descend
+from latentds.training import Plan, Training, descend
 
 PLANS = {
     "official": Plan(epochs=5000, learning_rate=1e-4, weight_decay=1e-10, clip=0.1, patience=250),
-    "tuned": Plan(epochs=1000, learning_rate=1e-3, n_batches=4, warm_up=0.05, clip=1.0, slack=0.3),
+    "tuned": Plan(epochs=300, learning_rate=1e-3, n_batches=4, warm_up=0.05, clip=1.0, slack=0.3),
 }
+STAGES = 8
+"""Steps from the chord to the demonstration in the tuned recipe."""
 GUARD = 1e-3
 """Share of the demonstration's latent length below which the speed falls linearly: a unit vector is not Lipschitz."""
 BEND = 0.05
 """Scale of the tuned recipe's straightness, in sizes of the demonstration."""
-FAR, KAPPA, TAIL_NODES, MAX_NODES = 1.5, 0.01, 40, 4096
 REST = 1e-2
 """Share of the mean speed below which the tuned recipe no longer asks for relative accuracy."""
+FAR = 1.5
+"""Latent lengths from the goal within which the nodes of a rollout are ``GUARD`` lengths apart; further out sparser."""
+TAIL = 40
+"""Nodes of a rollout within the guard, each a factor e nearer to the goal: the last is at 1e-20 of the length."""
 
 
 class SDSEF(LatentDS):
@@ -55,7 +62,7 @@ class SDSEF(LatentDS):
     def __init__(
         self, dim: int, *, n_layers: int = 10, n_features: int = 200, recipe: str = "tuned", seed: int | None = None
     ) -> None:
-        if recipe not in PLANS:
+        if recipe not in list(PLANS):
             raise ValueError(f"recipe: expected one of {sorted(PLANS)}, got {recipe!r}")
         self_seed = None if seed is None else whole_number(seed, "seed", at_least=0)
         generator = _generator(self_seed)
@@ -74,15 +81,8 @@ class SDSEF(LatentDS):
             self.dim, n_layers=psi.n_layers, n_features=psi.n_features, recipe=self.recipe, seed=self.seed
         ).to(self.attractor.device, torch.float32)
         data = _Normalized.of(shown)
-        loss = (_tuned_loss if self.recipe == "tuned" else _official_loss)(learner, data)
-        training = descend(
-            loss,
-            list(learner.parameters()),
-            len(data.points) if self.recipe == "official" else len(data.points) - len(shown),
-            PLANS[self.recipe],
-            generator=_generator(self.seed),
-            progress=progress,
-        )
+        train = _train_tuned if self.recipe == "tuned" else _train_official
+        training = train(learner, data, _generator(self.seed), progress)
         self.load_state_dict(learner.state_dict())
         self._place(data, shown)
         with torch.no_grad():
@@ -131,7 +131,7 @@ class NormalizedDescent(LatentDynamics):
         super().__init__(diffeomorphism.dim)
         object.__setattr__(self, "psi", diffeomorphism)
         sizes = [diffeomorphism.dim, 100, 100, 1]
-        linear = [_linear(a, b, generator) for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
+        linear = [_linear(a, b, generator) for a, b in pairwise(sizes)]
         self.network = nn.Sequential(linear[0], nn.LeakyReLU(), linear[1], nn.LeakyReLU(), linear[2])
         self.register_buffer("duration", torch.ones((), dtype=torch.float64))
         self.register_buffer("length", torch.ones((), dtype=torch.float64))
@@ -140,12 +140,13 @@ class NormalizedDescent(LatentDynamics):
     def forward(self, x: Tensor, y: Tensor) -> Tensor:
         offset = x - self.attractor
         distance = torch.linalg.vector_norm(offset, dim=-1).clamp(min=GUARD * self.length)
-        return -(self.speed(y) / distance).unsqueeze(-1) * offset
+        pull: Tensor = self.speed(y) / distance
+        return -pull.unsqueeze(-1) * offset
 
     def speed(self, y: Tensor) -> Tensor:
         """exp(g(y)), latent units per second: (..., n) -> (...)."""
-        log_speed = self.network(self.psi.normalize(y)).squeeze(-1)
-        return torch.exp(log_speed.clamp(*self.log_speed_range)) / self.duration
+        log_speed: Tensor = self.network(self.psi.normalize(y)).squeeze(-1)
+        return log_speed.clamp(*self.log_speed_range).exp() / self.duration
 
     def flow(self, x: Tensor, t: Tensor) -> Tensor:
         """Every motion runs on the ray from x to x*, so only its timing is integrated.
@@ -158,9 +159,9 @@ class NormalizedDescent(LatentDynamics):
         floor = torch.finfo(x.dtype).tiny ** 0.25
         distance = (offset.square().sum(-1) + (floor * self.length) ** 2).sqrt()
         begin = self._stretch(distance)
-        end = begin.detach().clamp(max=0.0) - TAIL_NODES
+        end = begin.detach().clamp(max=0.0) - TAIL
         spread = torch.nan_to_num((begin.detach() - end).amax() if begin.numel() else begin.new_tensor(1.0), posinf=0)
-        n_cells = int(spread.clamp(8, MAX_NODES).ceil())
+        n_cells = int(spread.clamp(8, 4096).ceil())
         step = (begin - end) / n_cells
         nodes = begin.unsqueeze(-1) - step.unsqueeze(-1) * torch.arange(n_cells + 1, dtype=x.dtype, device=x.device)
         radii, growth = self._unstretch(nodes)
@@ -175,30 +176,35 @@ class NormalizedDescent(LatentDynamics):
         first, last = slowness.gather(-1, cell), slowness.gather(-1, cell + 1)
         along = cell + _hermite((times - here) / (there - here), (there - here) / first, (there - here) / last)
         later, _ = self._unstretch(begin.unsqueeze(-1) - step.unsqueeze(-1) * along)
-        return self.attractor + later.unsqueeze(-1) * direction
+        states: Tensor = self.attractor + later.unsqueeze(-1) * direction
+        return states
 
     def _stretch(self, r: Tensor) -> Tensor:
-        """w(r): log(r/ε) below the guard ε, r/ε - 1 up to FAR lengths, then asinh(κ(w - w_far))/κ + w_far."""
+        """w(r): log(r/ε) below the guard ε, r/ε - 1 up to FAR lengths, then 100 asinh of a hundredth of the rest."""
         unit = r / (GUARD * self.length)
         edge = FAR / GUARD
-        beyond = torch.asinh(((unit - edge) * KAPPA).clamp(min=0)) / KAPPA
+        beyond = torch.asinh((unit - edge).clamp(min=0) / 100) * 100
         return torch.log(unit.clamp(max=1.0)) + unit.clamp(1.0, edge) - 1 + beyond
 
     def _unstretch(self, w: Tensor) -> tuple[Tensor, Tensor]:
         """r(w) and dr/dw."""
         edge = FAR / GUARD - 1
         tail = torch.exp(w.clamp(max=0.0))
-        beyond = ((w - edge) * KAPPA).clamp(min=0)
+        beyond = (w - edge).clamp(min=0) / 100
         scale = GUARD * self.length
-        return scale * (tail + w.clamp(0.0, edge) + torch.sinh(beyond) / KAPPA), scale * tail * torch.cosh(beyond)
+        return scale * (tail + w.clamp(0.0, edge) + 100 * torch.sinh(beyond)), scale * tail * torch.cosh(beyond)
 
 
 class _Normalized(NamedTuple):
-    """Demonstrations in units of their box and their duration, the last points last."""
+    """Demonstrations in units of their box and their mean duration; their m goals are the last points."""
 
     points: Tensor
     """(N, n) in [-1/2, 1/2]"""
     velocities: Tensor
+    """(N, n)"""
+    chord_points: Tensor
+    """(N, n) on the straight line from each start to each end, evenly in arc length"""
+    chord_velocities: Tensor
     """(N, n)"""
     owner: Tensor
     """(N,) which demonstration"""
@@ -220,54 +226,95 @@ class _Normalized(NamedTuple):
         center, extent = (low + high) / 2, high - low
         scale = extent.clamp(min=1e-6 * float(extent.max()))  # an axis at rest is noise, not motion
         duration = sum(d.duration for d in shown) / len(shown)
-        order = torch.cat([torch.arange(len(d)) == len(d) - 1 for d in shown]).to(torch.uint8).argsort(stable=True)
-        owner = torch.cat([torch.full((len(d),), i) for i, d in enumerate(shown)])
+        columns: list[tuple[Tensor, ...]] = []
+        for i, d in enumerate(shown):
+            points, velocities = (d.positions - center) / scale, d.velocities / scale * duration
+            steps = points.diff(dim=0).norm(dim=-1)
+            length, chord = steps.sum(), points[-1] - points[0]
+            progress = torch.cat([steps[:1] * 0, steps.cumsum(0)]) / length
+            rate = velocities.norm(dim=-1) / length
+            chords = points[0] + progress.unsqueeze(-1) * chord, rate.unsqueeze(-1) * chord
+            columns.append((points, velocities, *chords, torch.full((len(d),), i)))
+        last = torch.cat([torch.arange(len(d)) == len(d) - 1 for d in shown]).to(torch.uint8).argsort(stable=True)
+        starts = torch.stack([(d.start - center) / scale for d in shown])
+        samples = [torch.cat(column)[last] for column in zip(*columns, strict=True)]
+        points, velocities, chord_points, chord_velocities, owner = samples
         return cls(
-            ((every - center) / scale)[order],
-            (torch.cat([d.velocities for d in shown]) / scale * duration)[order],
-            owner[order],
-            (torch.stack([d.start for d in shown]) - center) / scale,
+            points,
+            velocities,
+            chord_points,
+            chord_velocities,
+            owner,
+            starts,
             (goal - center) / scale,
             center,
             scale,
             duration,
         )
 
+    def straightened(self, share: float) -> _Normalized:
+        """The demonstrations on their way from their chords, share 0, to themselves, share 1."""
+        return self._replace(
+            points=torch.lerp(self.chord_points, self.points, share),
+            velocities=torch.lerp(self.chord_velocities, self.velocities, share),
+        )
 
-def _official_loss(learner: SDSEF, data: _Normalized) -> Callable[[Tensor], Tensor]:
+
+def _train_official(learner: SDSEF, data: _Normalized, generator: torch.Generator | None, progress: bool) -> Training:
     points, velocities, goal = (part.to(learner.attractor) for part in (data.points, data.velocities, data.goal))
-    psi, network = learner.diffeomorphism, learner.dynamics.network
+    linearize, network = _linearize(learner), learner.dynamics.network
 
     def loss(batch: Tensor) -> Tensor:
         u = points[batch]
-        x, push = psi.linearize(torch.cat([u, goal.unsqueeze(0)]))
-        z = x - x[-1]
-        heading = z / torch.linalg.vector_norm(z, dim=-1, keepdim=True).clamp(min=1e-6)
-        predicted = -network(u).exp() * push(heading)[:-1]
+        x, push = linearize(torch.cat([u, goal.unsqueeze(0)]))
+        predicted = -network(u).exp() * push(_unit(x - x[-1]))[:-1]
         return nn.functional.smooth_l1_loss(predicted, velocities[batch])
 
-    return loss
+    return descend(
+        loss, list(learner.parameters()), len(points), PLANS["official"], generator=generator, progress=progress
+    )
+
+
+def _train_tuned(learner: SDSEF, data: _Normalized, generator: torch.Generator | None, progress: bool) -> Training:
+    """Continuation: chords are on one latent ray to begin with, and a curve that bends slowly is held there."""
+    plan = PLANS["tuned"]
+    history: list[float] = []
+    notes: list[str] = []
+    for stage in range(1, STAGES + 1):
+        bending = stage < STAGES
+        training = descend(
+            _tuned_loss(learner, data.straightened(stage / STAGES)),
+            list(learner.parameters()),
+            len(data.points) - len(data.starts),
+            replace(plan, epochs=max(1, plan.epochs // 8), warm_up=0.1) if bending else plan,
+            generator=generator,
+            progress=f"bend {stage} of {STAGES}" if progress and bending else progress,
+        )
+        history += training.history
+        notes += training.notes
+    return Training(tuple(history), tuple(notes))
 
 
 def _tuned_loss(learner: SDSEF, data: _Normalized) -> Callable[[Tensor], Tensor]:
     """2 mean(√(1 + ‖v̂-v‖²/‖v‖²) - 1) + mean(√(1 + ‖J_φ⁻¹ d / .05‖²) - 1) + mean ‖z/‖z‖ - e‖².
 
-    e is the direction of z at the demonstrated start and d = z - max(0, z·e) e the way off the ray along it.
+    e is the direction of z at the demonstrated start and d = z - max(0, z·e) e the way off the ray along it. The goals
+    themselves have no direction and are left out.
     """
     points, velocities, starts, goal = (
         part.to(learner.attractor) for part in (data.points, data.velocities, data.starts, data.goal)
     )
     owner = data.owner.to(points.device)
-    psi, network = learner.diffeomorphism, learner.dynamics.network
+    linearize, network = _linearize(learner), learner.dynamics.network
     squared_speeds = velocities.square().sum(-1)
     squared_speeds = squared_speeds + REST**2 * squared_speeds.mean()
     anchors = torch.cat([starts, goal.unsqueeze(0)])
 
     def loss(batch: Tensor) -> Tensor:
         u, v, n = points[batch], velocities[batch], len(batch)
-        x, push = psi.linearize(torch.cat([u, anchors]))
+        x, push = linearize(torch.cat([u, anchors]))
         z = x - x[-1]
-        heading = z / torch.linalg.vector_norm(z, dim=-1, keepdim=True).clamp(min=1e-6)
+        heading = _unit(z)
         ray = heading[n:-1][owner[batch]]
         aside = z[:n] - (z[:n] * ray).sum(-1, keepdim=True).clamp(min=0) * ray
         aside = torch.cat([aside, torch.zeros_like(anchors)])
@@ -275,9 +322,18 @@ def _tuned_loss(learner: SDSEF, data: _Normalized) -> Callable[[Tensor], Tensor]
         error = (-network(u).exp() * flow - v).square().sum(-1) / squared_speeds[batch]
         bend = (away / BEND).square().sum(-1)
         turn = (heading[:n] - ray).square().sum(-1)
-        return (2 * ((1 + error).sqrt() - 1) + (1 + bend).sqrt() - 1 + turn).mean()
+        return torch.mean(2 * ((1 + error).sqrt() - 1) + (1 + bend).sqrt() - 1 + turn)
 
     return loss
+
+
+def _unit(z: Tensor) -> Tensor:
+    return nn.functional.normalize(z, dim=-1, eps=1e-6)
+
+
+def _linearize(learner: SDSEF) -> Callable[[Tensor], tuple[Tensor, Callable[[Tensor], Tensor]]]:
+    psi = learner.diffeomorphism
+    return psi.compiled_linearize() if learner.attractor.device.type == "cpu" else psi.linearize
 
 
 def _cumulative(f: Tensor) -> Tensor:
@@ -300,7 +356,7 @@ def _generator(seed: int | None) -> torch.Generator | None:
 
 def _linear(n_in: int, n_out: int, generator: torch.Generator | None) -> nn.Linear:
     """torch's own initial weights, but from a generator and without touching the global one."""
-    layer = torch.nn.utils.skip_init(nn.Linear, n_in, n_out, dtype=torch.float64)
+    layer: nn.Linear = nn.utils.skip_init(nn.Linear, n_in, n_out, dtype=torch.float64)  # type: ignore[no-untyped-call]
     bound = n_in**-0.5
     for part in (layer.weight, layer.bias):
         nn.init.uniform_(part, -bound, bound, generator=generator)

@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import cast
+from functools import partial
+from typing import NamedTuple, cast
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from . import kernels
 from .arguments import positive, whole_number
+from .coupling_kernels import Couplings
 
 WIDTH_BOUND = math.sqrt(math.e / 2)
 """A layer x + exp(-ρ²‖x-c‖²) v is invertible while ρ‖v‖ < √(e/2) (Perrin and Schlehuber-Caissier 2016)."""
@@ -45,6 +49,17 @@ class Diffeomorphism(nn.Module, ABC):
     @abstractmethod
     def log_abs_det_jacobian(self, x: Tensor) -> Tensor:
         """log |det J_ψ(x)|: (..., n) -> (...)."""
+
+
+class Layers(NamedTuple):
+    """Locally weighted translations x + exp(-ρ²‖x-c‖²) v, first to last."""
+
+    centers: NDArray[np.float64]
+    """(m, n)"""
+    directions: NDArray[np.float64]
+    """(m, n)"""
+    widths: NDArray[np.float64]
+    """(m,) ρ > 0"""
 
 
 class LocallyWeightedTranslations(Diffeomorphism):
@@ -289,17 +304,31 @@ class AffineCouplings(Diffeomorphism):
         for source, layer in self._couplings():
             log_scale, shift, log_scale_slope, shift_slope = layer.with_slopes(parts[source])
             grown = parts[1 - source] * torch.exp(log_scale)
-            steps.append((source, torch.exp(-log_scale), grown.unsqueeze(-1) * log_scale_slope + shift_slope))
+            steps.append((torch.exp(-log_scale), grown.unsqueeze(-1) * log_scale_slope + shift_slope))
             parts[1 - source] = grown + shift
+        return self._join(parts), partial(self._push, steps)
 
-        def push(tangent: Tensor) -> Tensor:
-            parts = [tangent[..., 0::2], tangent[..., 1::2]]
-            for source, shrink, slope in reversed(steps):
-                sheared = (slope * parts[source].unsqueeze(-2)).sum(-1)
-                parts[1 - source] = (parts[1 - source] - sheared) * shrink
-            return self._join(parts) * self.scale
+    def compiled_linearize(self) -> Callable[[Tensor], tuple[Tensor, Callable[[Tensor], Tensor]]]:
+        """:meth:`linearize` for training on the CPU in float32: several times faster, differentiable once.
 
-        return self._join(parts), push
+        Takes (N, n) points. Reads the frozen features now, the amplitudes and the normalisation at every call.
+        """
+        layers = [layer for _, layer in self._couplings()]
+        compiled = Couplings([layer.frequencies for layer in layers], [layer.phases for layer in layers])
+
+        def linearize(y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+            x, steps = compiled.sweep(self.normalize(y), [layer.amplitudes for layer in layers])
+            return x, partial(self._push, steps)
+
+        return linearize
+
+    def _push(self, steps: list[tuple[Tensor, Tensor]], tangent: Tensor) -> Tensor:
+        """J_ψ t, layer by layer, from the (shrinking, slope) of each that the sweep to x left."""
+        parts = [tangent[..., 0::2], tangent[..., 1::2]]
+        for j in reversed(range(len(steps))):
+            (shrink, slope), source = steps[j], j % 2
+            parts[1 - source] = (parts[1 - source] - (slope * parts[source].unsqueeze(-2)).sum(-1)) * shrink
+        return self._join(parts) * self.scale
 
     def jacobian(self, x: Tensor) -> Tensor:
         _, push = self.linearize(self(x))

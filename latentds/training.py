@@ -65,7 +65,7 @@ def descend(
     plan: Plan,
     *,
     generator: torch.Generator | None = None,
-    progress: bool = False,
+    progress: bool | str = False,
 ) -> Training:
     """Minimise the mean of ``loss`` over samples; the parameters are left as they entered the best epoch.
 
@@ -78,7 +78,7 @@ def descend(
         n_samples: how many samples there are, >= 1.
         plan: how.
         generator: draws the batches (torch's global one if None).
-        progress: show a bar on the terminal.
+        progress: show a bar on the terminal, with this title if it is one.
 
     Raises:
         ValueError: if the loss is not finite at the start already.
@@ -148,8 +148,9 @@ def _copy(targets: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
 
 
 @contextmanager
-def _bar(total: int, shown: bool) -> Iterator[Callable[[float], None]]:
+def _bar(total: int, shown: bool | str) -> Iterator[Callable[[float], None]]:
     """A function to call after every epoch with the best loss; lines on stderr where rich is not installed."""
+    title = shown if isinstance(shown, str) else "learning"
     if not shown:
         yield lambda best: None
         return
@@ -162,11 +163,11 @@ def _bar(total: int, shown: bool) -> Iterator[Callable[[float], None]]:
             nonlocal done
             done += 1
             if done % max(1, total // 10) == 0:
-                print(f"epoch {done}/{total}, best loss {best:.4g}", file=sys.stderr)
+                print(f"{title}: epoch {done}/{total}, best loss {best:.4g}", file=sys.stderr)
 
         yield line
         return
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total} epochs"))
     with Progress(*columns, TimeRemainingColumn()) as bar:
-        task = bar.add_task("learning", total=total)
-        yield lambda best: bar.update(task, advance=1, description=f"best loss {best:.4g}")
+        task = bar.add_task(title, total=total)
+        yield lambda best: bar.update(task, advance=1, description=f"{title}, best loss {best:.4g}")
