@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numba
@@ -98,14 +98,14 @@ class _Recomputed(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        compiled: Callable[..., Tensor],
+        compute: Callable[..., Tensor],
         torch_path: Callable[..., Tensor],
         module: nn.Module,
         *tensors: Tensor,
     ) -> Tensor:
         ctx.torch_path, ctx.module = torch_path, module
         ctx.save_for_backward(*tensors)
-        return compiled(module, *tensors[: -len(_PARAMETERS)])
+        return compute(*tensors[: -len(_PARAMETERS)])
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
@@ -123,37 +123,40 @@ class _Recomputed(torch.autograd.Function):
 
 
 def _evaluate(
-    compiled: Callable[..., Tensor], torch_path: Callable[..., Tensor], module: nn.Module, *tensors: Tensor
+    compute: Callable[..., Tensor], torch_path: Callable[..., Tensor], module: nn.Module, *tensors: Tensor
 ) -> Tensor:
+    """``compute`` of the tensors, with a graph that leads to ``torch_path`` of the module if one is asked for."""
     if torch.is_grad_enabled():
         learned = [module._parameters[name] for name in _PARAMETERS]
         if any(t.requires_grad for t in (*tensors, *learned)):  # type: ignore[union-attr]
-            return _Recomputed.apply(compiled, torch_path, module, *tensors, *learned)  # type: ignore[no-any-return,no-untyped-call]
-    return compiled(module, *tensors)
+            return _Recomputed.apply(compute, torch_path, module, *tensors, *learned)  # type: ignore[no-any-return,no-untyped-call]
+    return compute(*tensors)
 
 
 # --- what diffeomorphism.py calls -------------------------------------------------------------------------------------
 
 
 def forward(module: LocallyWeightedTranslations, x: Tensor) -> Tensor:
-    return _evaluate(_forward, type(module).forward, module, x)
+    return _evaluate(partial(_forward, layers_of(module)), type(module).forward, module, x)
 
 
 def inverse(module: LocallyWeightedTranslations, y: Tensor) -> Tensor:
-    return _evaluate(_inverse, type(module).inverse, module, y)
+    return _evaluate(partial(_inverse, layers_of(module)), type(module).inverse, module, y)
 
 
 def jacobian(module: LocallyWeightedTranslations, x: Tensor) -> Tensor:
-    return _evaluate(_jacobian, type(module).jacobian, module, x)
+    return _evaluate(partial(_jacobian, layers_of(module)), type(module).jacobian, module, x)
 
 
 def linearize(module: LocallyWeightedTranslations, y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-    x = inverse(module, y)
+    layers = layers_of(module)
+    x = _evaluate(partial(_inverse, layers), type(module).inverse, module, y)
 
     def push(tangent: Tensor) -> Tensor:
         if not (_alone() and _plain(tangent, x.dtype)):
             return _pushed(module, x, tangent)
-        return _evaluate(_push, _pushed, module, *torch.broadcast_tensors(x, tangent))  # type: ignore[no-untyped-call]
+        points, tangents = torch.broadcast_tensors(x, tangent)  # type: ignore[no-untyped-call]
+        return _evaluate(partial(_push, layers), _pushed, module, points, tangents)
 
     return x, push
 
@@ -162,42 +165,39 @@ def _pushed(module: LocallyWeightedTranslations, x: Tensor, tangent: Tensor) -> 
     return (module.jacobian(x) @ tangent.unsqueeze(-1)).squeeze(-1)
 
 
-def _forward(module: LocallyWeightedTranslations, x: Tensor) -> Tensor:
+def _forward(layers: Array, x: Tensor) -> Tensor:
     points = _rows(x)
-    out = np.empty_like(points)
-    nothing = np.empty((1, 0))
-    _run(
-        lambda block: _sweep(module.dim, 0, block), layers_of(module), points, nothing, out, np.empty((len(points), 0))
-    )
+    out, nothing = np.empty_like(points), np.empty((1, 0))
+    kernel = partial(_sweep, points.shape[1], 0)
+    _run(kernel, layers, points, nothing, out, np.empty((len(points), 0)))
     return _tensor(out, x, x.shape)
 
 
-def _inverse(module: LocallyWeightedTranslations, y: Tensor) -> Tensor:
+def _inverse(layers: Array, y: Tensor) -> Tensor:
     points = _rows(y)
     out = np.empty_like(points)
-    _run(lambda block: _unwind(module.dim, block), layers_of(module), points, out)
+    _run(partial(_unwind, points.shape[1]), layers, points, out)
     return _tensor(out, y, y.shape)
 
 
-def _push(module: LocallyWeightedTranslations, x: Tensor, tangent: Tensor) -> Tensor:
+def _push(layers: Array, x: Tensor, tangent: Tensor) -> Tensor:
     points, tangents = _rows(x), _rows(tangent)
     moved, out = np.empty_like(points), np.empty_like(tangents)
-    _run(lambda block: _sweep(module.dim, 1, block), layers_of(module), points, tangents, moved, out)
+    _run(partial(_sweep, points.shape[1], 1), layers, points, tangents, moved, out)
     return _tensor(out, x, x.shape)
 
 
-def _jacobian(module: LocallyWeightedTranslations, x: Tensor) -> Tensor:
-    points, dim = _rows(x), module.dim
+def _jacobian(layers: Array, x: Tensor) -> Tensor:
+    points, dim = _rows(x), x.shape[-1]
     moved, out = np.empty_like(points), np.empty((len(points), dim * dim))
-    start = np.eye(dim).reshape(1, -1)
-    _run(lambda block: _sweep(dim, dim, block), layers_of(module), points, start, moved, out)
+    _run(partial(_sweep, dim, dim), layers, points, np.eye(dim).reshape(1, -1), moved, out)
     return _tensor(out, x, (*x.shape, dim))
 
 
 def layers_of(module: LocallyWeightedTranslations) -> Array:
     """The layers as the kernels read them, a row (c, v, ρ², ρ²‖v‖²) each: (M, 2n+2).
 
-    Made anew for every call, in about a microsecond, so that it is never stale.
+    Made anew for every call, in some microseconds, so that it is never stale.
     """
     arrays = [module._parameters[name].detach().numpy() for name in _PARAMETERS]  # type: ignore[union-attr]
     return _pack()(*(np.ascontiguousarray(a, dtype=np.float64) for a in arrays))  # type: ignore[no-any-return]
