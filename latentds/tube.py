@@ -29,11 +29,13 @@ Array = NDArray[np.float64]
 N_POINTS = 600
 """Points, even in arc length, that ψ is matched on."""
 NARROWEST = 3.0
-"""Least width 1/ρ of a greedy layer, in distances between those points."""
+"""Least width 1/ρ of a greedy layer, in distances between those points: a narrower one fits a point with a spike."""
 TUBE = 0.02
 """Radius of the tube that the report speaks of, in lengths of the latent line."""
 NEAR = 0.05
 """Distance from the demonstrated start, in sizes of the motion, of the starts that a match is also judged by."""
+ENOUGH = 0.06
+"""Score below which no further match is refined; three times as much will do after three."""
 FAR = 0.25
 """Distance from the axis, in sizes of the motion, beyond which the inward pull stops growing."""
 
@@ -93,16 +95,19 @@ class TubeDS(LatentDS):
         path, way, times = arc_length_path(shown.positions.numpy(), shown.times.numpy(), N_POINTS)
         _refuse_crossings(path)
         law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
-        best, lowest = None, math.inf
+        judged = []
         for candidate in _candidates(path, self.psi.n_layers):
             self._lay(candidate, shown, law)
-            if (score := self._score(shown)) < lowest:
-                best, lowest = candidate, score
-        assert best is not None
+            judged.append((self._score(shown), candidate))
+        judged.sort(key=lambda pair: pair[0])
         if self.refined:
-            better = best.refined(path)
-            self._lay(better, shown, law)
-            best = better if self._score(shown) < lowest else best
+            for tried, (_, candidate) in enumerate(list(judged)):
+                if tried and min(score for score, _ in judged) < (ENOUGH if tried < 3 else 3 * ENOUGH):
+                    break
+                better = candidate.refined(path)
+                self._lay(better, shown, law)
+                judged.append((self._score(shown), better))
+        best = min(judged, key=lambda pair: pair[0])[1]
         self._lay(best, shown, law)
         self.fit_report = self._report(best, path, shown, spread, began)
         return self
@@ -128,7 +133,7 @@ class TubeDS(LatentDS):
 
     @torch.no_grad()
     def _score(self, shown: Demonstration) -> float:
-        """How badly it rolls out from the demonstrated start and from NEAR around it, times the root of cond(J)."""
+        """How badly it rolls out from the demonstrated start (thrice) and NEAR it, times the root of cond(J)."""
         rows = np.linspace(0, len(shown) - 1, 200).round().astype(int)
         motion = shown.positions[rows]
         offsets = NEAR * shown.size * torch.eye(self.dim, dtype=motion.dtype)
@@ -137,7 +142,7 @@ class TubeDS(LatentDS):
         if not bool(torch.isfinite(paths).all()):
             return math.inf
         misses = [dtw(path, motion) / len(rows) / shown.size for path in paths]
-        return (misses[0] + float(np.mean(misses[1:]))) * math.sqrt(self._condition(self._line()))
+        return (3 * misses[0] + float(np.mean(misses[1:]))) * math.sqrt(self._condition(self._line()))
 
     def _line(self, n_points: int = 150) -> Tensor:
         """Latent points from the encoded start to x*, (n_points, n)."""
@@ -192,7 +197,8 @@ class Candidate(NamedTuple):
     def mse(self, path: Array) -> float:
         psi = LocallyWeightedTranslations(path.shape[1], len(self.layers.widths))
         psi.assign(*(torch.from_numpy(part) for part in self.layers))
-        return float((psi(torch.from_numpy(self.line)) - torch.from_numpy(path)).square().mean())
+        with torch.no_grad():
+            return float((psi(torch.from_numpy(self.line)) - torch.from_numpy(path)).square().mean())
 
 
 def _candidates(path: Array, n_layers: int) -> Iterator[Candidate]:
@@ -200,17 +206,16 @@ def _candidates(path: Array, n_layers: int) -> Iterator[Candidate]:
     steps = max(1, min(20, n_layers // 10))
     chord = place(straight_column(len(path)), path[0], path[-1])
     middle = chord.mean(0)
-    # A layer narrower than the points are apart fits one of them and puts a spike into the velocity.
-    narrowest = NARROWEST * float(np.linalg.norm(path[1] - path[0]))
+    apart = float(np.linalg.norm(path[1] - path[0]))
     for stretch in (1.0, 2.0):
         line = middle + stretch * (chord - middle)
-        yield Candidate(
-            "straight", match_along(straight_isotopy(line, path, steps), n_layers, 0.9, 0.9, narrowest), line
-        )
+        curves = straight_isotopy(line, path, steps)
+        yield Candidate("straight", match_along(curves, n_layers, 0.9, 0.9, NARROWEST * apart), line)
     if path.shape[1] > 1:
         curves = unbending_isotopy(path, steps)
-        for beta in (0.9, 0.5):
-            yield Candidate("unbending", match_along(curves, n_layers, beta, 0.9, narrowest), curves[0])
+        for share, beta, wider in ((1.0, 0.9, 0.5), (1.0, 0.9, 2.0), (0.4, 0.3, 2.0)):
+            layers = match_along(curves, math.ceil(share * n_layers), beta, 0.9, wider * NARROWEST * apart)
+            yield Candidate("unbending", layers, curves[0])
 
 
 def mean_motion(shown: Sequence[Demonstration]) -> tuple[Demonstration, tuple[float, ...]]:
