@@ -256,13 +256,22 @@ def _workers(cores: int) -> ThreadPoolExecutor:
 # --- compiling --------------------------------------------------------------------------------------------------------
 
 
+def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """``numba.njit`` with its cache on disk, or without where no place for one can be written (a read-only install)."""
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        try:
+            return numba.njit(cache=True, **options)(function)
+        except RuntimeError:
+            return numba.njit(**options)(function)
+
+    return decorate
+
+
 def compiled(function: Callable[..., Any], signature: str) -> Any:
     """``function`` as machine code, from the cache on disk if it is there; says so if compiling took over a second."""
     began = time.perf_counter()
-    try:
-        kernel = numba.njit(cache=True, **OPTIONS)(function)
-    except RuntimeError:  # neither the package's nor the user's cache directory can be written
-        kernel = numba.njit(**OPTIONS)(function)
+    kernel = cached(**OPTIONS)(function)
     kernel.compile(signature)
     seconds = time.perf_counter() - began
     if seconds > 1 and not kernel.stats.cache_hits:

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 from fastdtw import fastdtw
-from numba import njit
 from numpy.typing import NDArray
 
 from .arguments import real_array, whole_number
+from .kernels import cached
 
 Array = NDArray[np.float64]
 NAN = float("nan")
@@ -133,7 +133,7 @@ def _finite(a: Array, b: Array) -> bool:
     return bool((np.abs(a) < 1e150).all() and (np.abs(b) < 1e150).all())
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@cached()
 def _distances_to(point: Array, points: Array, out: Array) -> None:
     for j in range(points.shape[0]):
         total = 0.0
@@ -143,7 +143,7 @@ def _distances_to(point: Array, points: Array, out: Array) -> None:
         out[j] = np.sqrt(total)
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@cached()
 def _dtw(a: Array, b: Array) -> float:
     distances = np.empty(b.shape[0])
     row = np.empty(b.shape[0])
@@ -158,7 +158,7 @@ def _dtw(a: Array, b: Array) -> float:
     return float(row[-1])
 
 
-@njit(cache=True)  # type: ignore[untyped-decorator]
+@cached()
 def _frechet(a: Array, b: Array) -> float:
     distances = np.empty(b.shape[0])
     row = np.empty(b.shape[0])

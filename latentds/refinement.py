@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from .diffeomorphism import WIDTH_BOUND, Layers
+from .kernels import cached
 
 Array = NDArray[np.float64]
 
@@ -68,7 +68,7 @@ def refine(layers: Layers, x: Array, y: Array, mu: float, *, weights: Array | No
     return Layers(centers, directions, widths)
 
 
-_fast = njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
+_fast = cached(nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
 
 
 @_fast
