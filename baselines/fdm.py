@@ -46,5 +46,6 @@ class FDM(LatentDS):
     def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> FDM:
         shown = only_demonstration(demonstration, self.dim, "FDM")
         latent = place(straight_column(len(shown)), shown.start.numpy(), shown.goal.numpy())
-        settle(self, latent, shown, PiecewiseLinearLaw.uniform(shown.duration), progress=progress)
+        law = PiecewiseLinearLaw.uniform(shown.duration)
+        settle(self, latent, shown, law, beta=self.beta, mu=self.mu, steps=self.steps, refined=self.refined)
         return self

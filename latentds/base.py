@@ -134,7 +134,8 @@ class LatentDS(StableDS):
     def decode(self, x: Tensor) -> Tensor:
         """ψ: latent -> demonstration, (..., n) -> (..., n)."""
         points, wanted = self._points(x, "x")
-        return self.diffeomorphism(points).to(wanted)
+        decoded: Tensor = self.diffeomorphism(points)
+        return decoded.to(wanted)
 
     def jacobian(self, x: Tensor) -> Tensor:
         """J_ψ at latent ``x``, in closed form: (..., n) -> (..., n, n)."""

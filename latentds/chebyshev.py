@@ -50,5 +50,6 @@ class ChebyshevDS(LatentDS):
         shown = only_demonstration(demonstration, self.dim, "ChebyshevDS")
         columns = chebyshev_columns(len(shown), self.dim)[::-1]
         latent = place(columns, shown.start.numpy(), shown.goal.numpy())
-        settle(self, latent, shown, ChebyshevLaw(shown.duration), progress=progress)
+        law = ChebyshevLaw(shown.duration)
+        settle(self, latent, shown, law, beta=self.beta, mu=self.mu, steps=self.steps, refined=self.refined)
         return self

@@ -51,7 +51,7 @@ def place(columns: Array, start: Array, goal: Array) -> Array:
     A coordinate in which start and goal coincide collapses to it.
     """
     progress = (columns - columns[0]) / (columns[-1] - columns[0])
-    placed = start + progress * (goal - start)
+    placed: Array = start + progress * (goal - start)
     placed[-1] = goal
     return placed
 

@@ -17,7 +17,8 @@ def straight_isotopy(x: Array, y: Array, steps: int) -> Array:
     itself on the way, and then no diffeomorphism follows.
     """
     share = np.linspace(0, 1, whole_number(steps, "steps", at_least=1) + 1)[:, None, None]
-    return x + share * (y - x)
+    moved: Array = x + share * (y - x)
+    return moved
 
 
 def unbending_isotopy(y: Array, steps: int) -> Array:
@@ -77,7 +78,7 @@ def _turned(frames: Array, turning: Array) -> Array:
     normal = np.einsum("kij,kj->ki", frames[:, :, 1:], axis)
     tangent = frames[:, :, 0]
     cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    turned = frames.copy()
+    turned: Array = frames.copy()
     turned[:, :, 0] = cosine * tangent + sine * normal
     change = (cosine - 1) * normal - sine * tangent
     turned[:, :, 1:] += change[:, :, None] * axis[:, None, :]
@@ -89,4 +90,5 @@ def _laid_on(curve: Array, other: Array) -> Array:
     centre, target = curve.mean(0), other.mean(0)
     left, _, right = np.linalg.svd((curve - centre).T @ (other - target))
     left[:, -1] *= np.sign(np.linalg.det(left @ right))
-    return (curve - centre) @ left @ right + target
+    laid: Array = (curve - centre) @ left @ right + target
+    return laid

@@ -62,8 +62,21 @@ def match_along(curves: Array, n_layers: int, beta: float, mu: float, narrowest:
     return Layers(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-def settle(ds: LatentDS, latent: Array, shown: Demonstration, law: TimeLaw, *, progress: bool) -> None:
-    """Fit ψ so that it maps ``latent`` (N, n) onto the demonstration, and lay the dynamics along it."""
+def settle(
+    ds: LatentDS,
+    latent: Array,
+    shown: Demonstration,
+    law: TimeLaw,
+    *,
+    beta: float,
+    mu: float,
+    steps: int = 1,
+    refined: bool = False,
+) -> None:
+    """Fit ψ so that it maps ``latent`` (N, n) onto the demonstration, and lay the dynamics along it.
+
+    ``steps`` of a straight isotopy; ``refined`` moves all layers together afterwards.
+    """
     began = time.perf_counter()
     psi, dynamics = ds.diffeomorphism, ds.dynamics
     assert isinstance(psi, LocallyWeightedTranslations)
@@ -71,9 +84,9 @@ def settle(ds: LatentDS, latent: Array, shown: Demonstration, law: TimeLaw, *, p
     if bool((shown.start == shown.goal).all()):
         raise ValueError("demonstration: expected a goal apart from the start, got a closed loop")
     points = shown.positions.numpy()
-    layers = match_along(straight_isotopy(latent, points, ds.steps), psi.n_layers, ds.beta, ds.mu)
-    if ds.refined:
-        layers = refine(layers, latent, points, ds.mu)
+    layers = match_along(straight_isotopy(latent, points, steps), psi.n_layers, beta, mu)
+    if refined:
+        layers = refine(layers, latent, points, mu)
     psi.assign(*(torch.from_numpy(part) for part in layers))
     dynamics.law = law.to(ds.attractor)
     with torch.no_grad():

@@ -335,5 +335,5 @@ def _shrink(law: TimeLaw, s: Tensor, t: Tensor) -> Tensor:
 
 def _off_zero(offset: Tensor) -> Tensor:
     """Length of (..., n) as (..., 1), held off zero far inside the linear tail, where h(s)/s no longer changes."""
-    floor = torch.finfo(offset.dtype).tiny ** 0.25
+    floor: float = torch.finfo(offset.dtype).tiny ** 0.25
     return (offset.square().sum(-1, keepdim=True) + floor**2).sqrt()
