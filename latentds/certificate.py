@@ -1,0 +1,356 @@
+"""What is proven about a fitted system, what was searched for in vain, and what turned out to be false."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .arguments import real_array, whole_number
+from .base import LatentDS, StableDS
+from .diffeomorphism import WIDTH_BOUND, AffineCouplings, LocallyWeightedTranslations
+
+Verdict = Literal["proven", "not falsified", "falsified"]
+
+
+@dataclass(frozen=True)
+class Line:
+    """One claim about a system.
+
+    Attributes:
+        claim: what is claimed.
+        verdict: "proven" by construction (checked on the parameters, exact arithmetic assumed), "not falsified" by a
+            search, or "falsified".
+        tries: points, starts or layers that were tried.
+        worst: the number nearest to breaking the claim, or the largest found after it broke; see ``detail``.
+        detail: what ``worst`` is.
+        counterexample: (n,) the point in demonstration space at which the claim fails, if it does at a point.
+    """
+
+    claim: str
+    verdict: Verdict
+    tries: int
+    worst: float
+    detail: str
+    counterexample: tuple[float, ...] | None = None
+
+    def __str__(self) -> str:
+        verdict = self.verdict + (f" in {self.tries} tries" if self.verdict == "not falsified" else "")
+        text = f"{verdict:28} {self.claim} ({self.detail} {self.worst:.3g})"
+        if self.counterexample is not None:
+            text += f"\n{'':28} at y = [{', '.join(f'{value:.6g}' for value in self.counterexample)}]"
+        return text
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What :func:`certify` found.
+
+    Attributes:
+        method: the system's class.
+        dim: n.
+        region: (low, high), corners of the box that was searched, each (n,).
+        n_samples, seed: of the search.
+        lines: one for each claim.
+    """
+
+    method: str
+    dim: int
+    region: tuple[tuple[float, ...], tuple[float, ...]]
+    n_samples: int
+    seed: int
+    lines: tuple[Line, ...]
+
+    @property
+    def holds(self) -> bool:
+        """Whether no claim was falsified."""
+        return not self.falsified
+
+    @property
+    def falsified(self) -> tuple[Line, ...]:
+        return tuple(line for line in self.lines if line.verdict == "falsified")
+
+    def __str__(self) -> str:
+        box = " x ".join(f"[{low:.3g}, {high:.3g}]" for low, high in zip(*self.region, strict=True))
+        head = f"{self.method}, {self.dim}-D, searched in {box} (seed {self.seed})"
+        return "\n".join([head, *(f"  {line}" for line in self.lines)])
+
+    def to_json(self) -> str:
+        """All fields as a JSON object; numbers that are not finite become strings."""
+        return json.dumps(_plain(asdict(self) | {"holds": self.holds}), indent=1, allow_nan=False)
+
+
+def certify(ds: StableDS, region: Any = None, *, n_samples: int = 1000, seed: int = 0) -> Certificate:
+    """State what holds of a system by construction, and try to falsify the rest.
+
+    Searched for, in the region: an attractor that moves, an inverse or a Jacobian that is off, folds, equilibria other
+    than the attractor, points at which V does not decrease, motions that do not arrive.
+
+    Args:
+        ds: any system, fitted or not; it is left as it is.
+        region: (2, n) lowest and highest corner of a box, in the units of the demonstration. By default one around the
+            image of the latent ball that the demonstration spans; needed for a system that is no
+            :class:`~latentds.LatentDS`.
+        n_samples: points to sample, >= 10. The costlier searches try fewer.
+        seed: of the samples, >= 0.
+
+    Raises:
+        ValueError: naming the argument, what was expected and what came.
+    """
+    if not isinstance(ds, StableDS):
+        raise ValueError(f"ds: expected a StableDS, got {type(ds).__name__}")
+    count = whole_number(n_samples, "n_samples", at_least=10)
+    generator = torch.Generator().manual_seed(whole_number(seed, "seed", at_least=0))
+    box = _region(ds, region, generator)
+    search = _Search(ds, box, count, generator)
+    corners = (tuple(box[0].tolist()), tuple(box[1].tolist()))
+    return Certificate(type(ds).__name__, ds.dim, corners, count, seed, tuple(search.lines()))
+
+
+class _Search:
+    """Everything is measured against the size of the region and the time that it takes to cross it."""
+
+    def __init__(self, ds: StableDS, box: Tensor, n_samples: int, generator: torch.Generator) -> None:
+        self.ds, self.box, self.generator = ds, box.to(ds.attractor), generator
+        self.goal = ds.attractor.detach()
+        self.size = float((box[1] - box[0]).max())
+        self.tolerance = torch.finfo(self.goal.dtype).eps ** 0.4  # 5e-7 in float64
+        inside = box[0] + (box[1] - box[0]) * self._uniform(n_samples - n_samples // 4, ds.dim)
+        radii = self.size * 10 ** (-3 * self._uniform(n_samples // 4, 1))
+        near = self.goal.cpu() + radii * self._directions(n_samples // 4)
+        points = torch.cat([inside.to(self.box), near.to(self.box).clamp(self.box[0], self.box[1])])
+        away = torch.linalg.vector_norm(points - self.goal, dim=-1) > 1e-4 * self.size
+        self.points = points[away]
+        with torch.no_grad():
+            self.velocity = ds(self.points)
+            speed = torch.linalg.vector_norm(self.velocity, dim=-1)
+        finite = speed[torch.isfinite(speed)]
+        self.speed = float(finite.median()) if len(finite) else math.nan
+        self.duration = self.size / self.speed if self.speed > 0 else 1.0
+
+    def lines(self) -> list[Line]:
+        found = [self._finite()]
+        if isinstance(self.ds, LatentDS):
+            found += [*self._layers(self.ds), *self._rate(self.ds)]
+        found += [self._attractor()]
+        if found[0].verdict == "falsified":
+            return found
+        if isinstance(self.ds, LatentDS):
+            found += [self._round_trip(self.ds), self._jacobian(self.ds), self._conditioning(self.ds)]
+        return [*found, self._equilibria(), self._descent(), self._convergence()]
+
+    def _finite(self) -> Line:
+        broken = ~torch.isfinite(self.velocity).all(-1)
+        return self._judge("velocities are finite", broken.to(self.goal), 0.5, "share that is not", self.points)
+
+    def _layers(self, ds: LatentDS) -> list[Line]:
+        psi = ds.diffeomorphism
+        if isinstance(psi, LocallyWeightedTranslations):
+            with torch.no_grad():
+                bound = psi.widths * torch.linalg.vector_norm(psi.directions, dim=-1) / WIDTH_BOUND
+            margins = torch.nan_to_num(torch.minimum(psi.margins.detach(), 1 - bound + 1e-12), nan=-math.inf)
+            worst = int(margins.argmin())
+            fold = None if margins[worst] > 0 else self._fold(psi, worst)
+            claim, detail = "every layer is invertible, ρ‖v‖√(2/e) < 1", "smallest margin"
+            return [_settled(claim, len(margins), float(margins[worst]), detail, fold)]
+        if isinstance(psi, AffineCouplings):
+            # Every coupling scales by exp(bounded): positive, whatever the finite parameters are.
+            finite = all(bool(torch.isfinite(part).all()) for part in psi.state_dict().values())
+            scale = float(psi.scale.min())
+            claim = "every coupling has a positive determinant"
+            return [_settled(claim, psi.n_layers, scale if finite else -math.inf, "least scale")]
+        return []
+
+    def _rate(self, ds: LatentDS) -> list[Line]:
+        with torch.no_grad():
+            reach = torch.linalg.vector_norm(ds.encode(self.points) - ds.dynamics.attractor, dim=-1)
+            radius = float(reach[torch.isfinite(reach)].max()) if bool(torch.isfinite(reach).any()) else 1.0
+            rate = ds.dynamics.slowest_rate(radius)
+        if rate is None:
+            return []
+        claim = "latent motions approach the goal, -V̇/2V >= rate > 0"
+        return [_settled(claim, 1, rate, "least rate in the region, per second:")]
+
+    def _fold(self, psi: LocallyWeightedTranslations, index: int) -> tuple[float, ...]:
+        """Where a layer that breaks its bound folds space most."""
+        with torch.no_grad():
+            c, v, q = psi._layers()[index]
+            y = c + v / torch.linalg.vector_norm(v) / (2 * q).sqrt()
+            for c, v, q in psi._layers()[index:]:
+                y = y + torch.exp(-q * (y - c).square().sum(-1, keepdim=True)) * v
+        return tuple(y.tolist())
+
+    def _attractor(self) -> Line:
+        with torch.no_grad():
+            speed = float(torch.linalg.vector_norm(self.ds(self.goal))) / self.speed
+            later = self.ds.rollout(self.goal, torch.tensor([0.0, self.duration], dtype=torch.float64))
+            errors = [speed, float((later[-1] - self.goal).abs().max()) / self.size]
+            if isinstance(self.ds, LatentDS):
+                errors.append(float((self.ds.decode(self.ds.dynamics.attractor) - self.goal).abs().max()) / self.size)
+        worst = torch.tensor(errors).nan_to_num(nan=math.inf).amax().expand(1)
+        return self._judge("the attractor rests", worst, self.tolerance, "relative error", self.goal.unsqueeze(0))
+
+    def _round_trip(self, ds: LatentDS) -> Line:
+        with torch.no_grad():
+            error = torch.linalg.vector_norm(ds.decode(ds.encode(self.points)) - self.points, dim=-1) / self.size
+        return self._judge("decode inverts encode", error, self.tolerance, "relative error", self.points)
+
+    def _jacobian(self, ds: LatentDS) -> Line:
+        points = self.points[:: max(1, len(self.points) // 64)]
+        with torch.no_grad():
+            x = ds.encode(points)
+            closed = ds.jacobian(x)
+        x = x.requires_grad_()
+        decoded = ds.decode(x)
+        rows = [torch.autograd.grad(column.sum(), x, retain_graph=True)[0] for column in decoded.unbind(-1)]
+        wanted = torch.stack(rows, dim=-2)
+        error = torch.linalg.matrix_norm(closed - wanted) / torch.linalg.matrix_norm(wanted)
+        return self._judge("the closed-form Jacobian is autograd's", error, self.tolerance, "relative error", points)
+
+    def _conditioning(self, ds: LatentDS) -> Line:
+        with torch.no_grad():
+            jacobians = ds.jacobian(ds.encode(self.points)).to(torch.float64)
+            condition = torch.linalg.cond(jacobians).nan_to_num(nan=math.inf)
+            signs = torch.linalg.slogdet(jacobians)[0]
+        folded = signs != signs.median()
+        limit = 1 / torch.finfo(self.goal.dtype).eps
+        badness = torch.where(folded, math.inf, condition)
+        claim = "ψ neither folds nor flattens space"
+        return self._judge(claim, badness, limit, "cond(J)", self.points)
+
+    def _equilibria(self) -> Line:
+        """Damped Newton steps on f(y)/‖y - y*‖ = 0; dividing takes the attractor itself away from the solver."""
+
+        def slowness(y: Tensor) -> Tensor:
+            offset = torch.linalg.vector_norm(y - self.goal, dim=-1, keepdim=True)
+            velocity: Tensor = self.ds(y)
+            slow: Tensor = velocity / offset.clamp(min=1e-9 * self.size) * self.duration
+            return slow
+
+        lengths = torch.tensor([2.0, 1.0, 0.3]).to(self.points).view(-1, 1, 1, 1)  # 2 is right for a double root
+        damping = torch.tensor([1e-12, 1e-4, 1e-2, 1.0]).to(self.points).view(-1, 1, 1)
+        nudge = 1e-3 * self.tolerance**0.5 * self.size
+        nudges = nudge * torch.eye(self.ds.dim).to(self.points)
+        with torch.no_grad():
+            y, relative = self.points, torch.linalg.vector_norm(slowness(self.points), dim=-1)
+            for _ in range(30):
+                ahead, behind = (slowness(y.unsqueeze(-2) + side * nudges) for side in (1, -1))
+                slopes = (ahead - behind).mT.nan_to_num() / (2 * nudge)
+                left, stretch, right = torch.linalg.svd(slopes)
+                along = (left.mT @ slowness(y).nan_to_num().unsqueeze(-1)).squeeze(-1)
+                damped = along * stretch / (stretch.square() + damping * stretch[:, :1].square()).clamp(min=1e-300)
+                trials = (y - lengths * (damped.unsqueeze(-2) @ right).squeeze(-2)).flatten(0, 1)
+                trials = trials.clamp(self.box[0], self.box[1])
+                left_over = torch.linalg.vector_norm(slowness(trials), dim=-1).nan_to_num(nan=math.inf)
+                best = left_over.argmin(0)
+                rows = left_over.amin(0).argsort()[: max(32, len(y) // 2)]  # give up the worse half at every step
+                y = trials[best, torch.arange(len(y))][rows]
+            every = torch.cat([self.points, y])
+            relative = torch.cat([relative, left_over.amin(0)[rows]])
+        away = torch.linalg.vector_norm(every - self.goal, dim=-1) > 1e-4 * self.size
+        claim, detail = "no equilibrium but the attractor", "-least relative speed"
+        # Still moving: the limit is far below any pause that a fit leaves in a motion.
+        return self._judge(claim, -relative[away], -1e-10, detail, every[away])
+
+    def _descent(self) -> Line:
+        """Sampling, then gradient ascent on V̇/V from the worst points, by differences."""
+        relative, cosine = self._slopes(self.points)
+        every, cosines = [self.points], [cosine]
+        nudge = 1e-4 * self.size
+        nudges = nudge * torch.cat([torch.zeros(1, self.ds.dim), torch.eye(self.ds.dim)]).to(self.points)
+        y = self.points[torch.cat([relative.argsort()[-16:], cosine.argsort()[-16:]])]
+        for stage in range(8):
+            around = (y.unsqueeze(-2) + nudges).flatten(0, 1)
+            relative, cosine = self._slopes(around)
+            every.append(around)
+            cosines.append(cosine)
+            relative = relative.view(len(y), -1)
+            uphill = torch.nn.functional.normalize((relative[:, 1:] - relative[:, :1]).nan_to_num(), dim=-1)
+            y = (y + 0.02 * 0.8**stage * self.size * uphill).clamp(self.box[0], self.box[1])
+        points = torch.cat(every)
+        away = torch.linalg.vector_norm(points - self.goal, dim=-1) > 1e-4 * self.size
+        claim, detail = "V decreases, V̇ < 0", "largest cosine of ∇V and f"
+        return self._judge(claim, torch.cat(cosines)[away], 1e-3 * self.tolerance, detail, points[away])
+
+    def _slopes(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """V̇/V, and the cosine of ∇V and f: both (B,)."""
+        y = points.detach().clone().requires_grad_()
+        energy = self.ds.lyapunov(y)
+        (uphill,) = torch.autograd.grad(energy.sum(), y)
+        with torch.no_grad():
+            velocity = self.ds(points)
+        slope = (uphill * velocity).sum(-1)
+        steepest = torch.linalg.vector_norm(uphill, dim=-1) * torch.linalg.vector_norm(velocity, dim=-1)
+        relative = torch.where(torch.isfinite(slope), slope / energy.detach(), math.inf)
+        return relative, torch.where(steepest == 0, 0.0, slope / steepest)
+
+    def _convergence(self) -> Line:
+        starts = self.points[:: max(1, len(self.points) // 64)]
+        state, horizon = starts, self.duration
+        left = torch.full_like(starts[:, 0], math.inf)
+        for _ in range(40):  # twice the time at each stage
+            with torch.no_grad():
+                state = self.ds.rollout(state, torch.tensor([0.0, horizon], dtype=torch.float64))[:, -1]
+            left = torch.linalg.vector_norm(state - self.goal, dim=-1) / self.size
+            if bool((left < 1e-3).all()) or not bool(torch.isfinite(left).all()):
+                break
+            horizon *= 2
+        return self._judge("every motion arrives", left, 1e-3, "largest distance left", starts)
+
+    def _judge(self, claim: str, badness: Tensor, limit: float, detail: str, points: Tensor) -> Line:
+        """Falsified where ``badness`` (B,) is above ``limit``, or NaN, at one of the ``points`` (B, n)."""
+        badness = badness.nan_to_num(nan=math.inf)
+        worst = int(badness.argmax())
+        holds = float(badness[worst]) <= limit
+        point = None if holds else tuple(points[worst].tolist())
+        verdict: Verdict = "not falsified" if holds else "falsified"
+        return Line(claim, verdict, len(badness), float(badness[worst]), detail, point)
+
+    def _uniform(self, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=self.generator, dtype=torch.float64)
+
+    def _directions(self, count: int) -> Tensor:
+        draws = torch.randn(count, self.ds.dim, generator=self.generator, dtype=torch.float64)
+        return torch.nn.functional.normalize(draws, dim=-1)
+
+
+def _settled(
+    claim: str, tries: int, worst: float, detail: str, counterexample: tuple[float, ...] | None = None
+) -> Line:
+    """A claim about parameters, true or not: that ``worst`` > 0."""
+    holds = worst > 0 and math.isfinite(worst)
+    return Line(claim, "proven" if holds else "falsified", tries, worst, detail, counterexample)
+
+
+def _region(ds: StableDS, region: Any, generator: torch.Generator) -> Tensor:
+    if region is not None:
+        corners = real_array(region, "region")
+        if corners.shape != (2, ds.dim) or not np.isfinite(corners).all() or not (corners[0] < corners[1]).all():
+            raise ValueError(f"region: expected (2, {ds.dim}) finite corners, low below high, got {corners.tolist()}")
+        return torch.from_numpy(corners)
+    length = getattr(ds.dynamics, "length", None) if isinstance(ds, LatentDS) else None
+    if not isinstance(ds, LatentDS) or length is None:
+        raise ValueError(f"region: expected (2, {ds.dim}) corners, as {type(ds).__name__} implies none, got None")
+    draws = torch.randn(256, ds.dim, generator=generator, dtype=torch.float64)
+    directions = torch.nn.functional.normalize(draws, dim=-1)
+    radii = torch.linspace(0.1, 1, 256, dtype=torch.float64).unsqueeze(-1)
+    with torch.no_grad():
+        ball = ds.dynamics.attractor + length * (radii * directions).to(ds.attractor)
+        points = torch.cat([ds.decode(ball), ds.attractor.unsqueeze(0)]).cpu().double()
+    points = points[torch.isfinite(points).all(-1)]
+    low, high = points.amin(0), points.amax(0)
+    margin = (0.25 * (high - low)).clamp(min=0.01 * float((high - low).max()))
+    return torch.stack([low - margin, high + margin])
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(part) for key, part in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(part) for part in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
