@@ -1,6 +1,6 @@
 """The paper's head-to-head: every method learns ten spirals and starts at the demonstrated point and 20 around it.
 
-    python -m experiments.spirals [--quick] [--out results/spirals] [--jobs N] [--seeds 0 --seeds 1 …]
+    python -m experiments.spirals [--quick] [--out results/spirals] [--jobs N] [--seeds 0 --seeds 1 …] [--dask tcp://…]
 
 Leaves rows.csv, summary.md, settings.json and pictures in ``--out``.
 """
@@ -8,10 +8,13 @@ Leaves rows.csv, summary.md, settings.json and pictures in ``--out``.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
+import joblib
 import numpy as np
 import pandas as pd
 import typer
@@ -83,20 +86,25 @@ def main(
     ),
     jobs: Annotated[int | None, typer.Option(help="Processes; all cores by default.")] = None,
     seeds: Annotated[list[int] | None, typer.Option(help="Repeat for more; 0 by default.")] = None,
+    dask: Annotated[str | None, typer.Option(help="Scheduler of a Dask cluster, tcp://…, to run on.")] = None,
 ) -> None:
-    """Compare the methods on the paper's spirals."""
+    """Compare the methods on the paper's spirals.
+
+    Finished cells are kept in cells.sqlite beside the results: an interrupted run goes on where it stopped.
+    """
     began, console = time.perf_counter(), Console()
     shown, seeds = spirals(quick), seeds or [0]
     cells = [Cell(label, f, d, seed) for d in shown for label, f in methods(d.name, quick).items() for seed in seeds]
     done: list[Outcome] = []
+    out.mkdir(parents=True, exist_ok=True)
     try:
-        for outcome in run(cells, n_jobs=jobs, progress=True):
-            done.append(outcome)
+        with cluster(dask):
+            for outcome in run(cells, n_jobs=jobs, progress=True, store=out / "cells.sqlite"):
+                done.append(outcome)
     except KeyboardInterrupt:
-        console.print(f"Interrupted: {len(done)} of {len(cells)} cells are done.")
+        console.print(f"Interrupted: {len(done)} of {len(cells)} cells are done; the same command goes on from here.")
     if done:
         rows = pd.DataFrame([row for outcome in done for row in outcome.rows], columns=list(COLUMNS))
-        out.mkdir(parents=True, exist_ok=True)
         seconds = time.perf_counter() - began
         settings = {
             "command": {"quick": quick, "jobs": jobs, "seeds": seeds, "seconds": round(seconds, 1)},
@@ -114,6 +122,20 @@ def main(
         console.print(f"{out}: rows.csv, summary.md, settings.json and pictures, after {seconds:.0f} s")
     if len(done) < len(cells):
         raise typer.Exit(130)
+
+
+@contextmanager
+def cluster(address: str | None) -> Iterator[None]:
+    """Joblib's work goes to the Dask cluster whose scheduler listens there; None: stays here."""
+    if address is None:
+        yield
+        return
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ImportError("--dask needs distributed: pip install 'latentds[distributed]'") from error
+    with Client(address), joblib.parallel_config(backend="dask"):
+        yield
 
 
 def summarize(rows: pd.DataFrame, spirals: list[str], labels: list[str]) -> str:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from . import kernels, metrics
 from .arguments import number_in, whole_number
 from .base import StableDS
 from .demonstration import Demonstration
+from .store import CellStore, fingerprint
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -117,6 +119,7 @@ def compare(
     n_points: int = 500,
     n_jobs: int | None = None,
     progress: bool = False,
+    store: str | os.PathLike[str] | None = None,
 ) -> pd.DataFrame:
     """Fit every method to every demonstration with every seed, roll each out from shared starts, and score it.
 
@@ -132,6 +135,9 @@ def compare(
         n_jobs: processes, as joblib counts them. None: what ``joblib.parallel_config`` says around the call (that is
             how cells go to a Dask or Ray cluster, too), without it all local cores. Rows do not depend on it.
         progress: show a bar with method, demonstration and time left.
+        store: a file that keeps every finished cell (:class:`latentds.store.CellStore`), so that a run that was
+            interrupted goes on where it stopped. A cell is known by its label, the method's settings and code, the
+            demonstration, the seed and the protocol: if one changes, it is computed anew. Failed cells are not kept.
 
     Returns:
         One row per method, demonstration, seed and start:
@@ -154,9 +160,9 @@ def compare(
     shown = [demonstrations] if isinstance(demonstrations, Demonstration) else demonstrations
     _check(methods, shown, seeds)
     cells = [Cell(label, factory, d, seed) for d in shown for label, factory in methods.items() for seed in seeds]
-    outcomes = run(cells, Protocol(n_starts, radius, n_points), n_jobs=n_jobs, progress=progress)
+    outcomes = run(cells, Protocol(n_starts, radius, n_points), n_jobs=n_jobs, progress=progress, store=store)
     rows = [row for outcome in outcomes for row in outcome.rows]
-    place = {key: i for i, key in enumerate((c.method, c.demonstration.name, c.seed) for c in cells)}
+    place = {key: i for i, key in enumerate(map(_name, cells))}
     rows.sort(key=lambda row: (place[row["method"], row["demonstration"], row["seed"]], row["start"]))
     frame: pd.DataFrame = pandas.DataFrame(rows, columns=list(COLUMNS))
     return frame
@@ -168,34 +174,76 @@ def run(
     *,
     n_jobs: int | None = None,
     progress: bool = False,
+    store: str | os.PathLike[str] | None = None,
 ) -> Iterator[Outcome]:
     """Outcomes of the cells, as they end; for studies in which a method's settings change with the demonstration.
 
     Args:
         cells: no two alike in method, demonstration's name and seed.
         protocol: the default one if None.
-        n_jobs, progress: as for :func:`compare`.
+        n_jobs, progress, store: as for :func:`compare`.
 
     Raises:
         ValueError: if two cells are alike, before any work.
     """
     cells = list(cells)
     protocol = Protocol() if protocol is None else protocol
-    _only_once("cells", [(c.method, c.demonstration.name, c.seed) for c in cells])
+    _only_once("cells", [_name(cell) for cell in cells])
     if n_jobs is not None and (isinstance(n_jobs, bool) or not isinstance(n_jobs, int) or n_jobs == 0):
         raise ValueError(f"n_jobs: expected a whole number other than 0, or None, got {n_jobs!r}")
-    return _run(cells, protocol, n_jobs, progress)
+    return _run(cells, protocol, n_jobs, progress, store)
 
 
-def _run(cells: list[Cell], protocol: Protocol, n_jobs: int | None, progress: bool) -> Iterator[Outcome]:
+def _run(
+    cells: list[Cell], protocol: Protocol, n_jobs: int | None, progress: bool, store: str | os.PathLike[str] | None
+) -> Iterator[Outcome]:
+    with (
+        _bar(len(cells)) if progress else nullcontext(lambda outcome: None) as advance,
+        nullcontext() if store is None else CellStore(store) as kept,
+    ):
+        keys = {} if kept is None else {_name(cell): _key(cell, protocol) for cell in cells}
+        todo = []
+        for cell in cells:
+            key = keys.get(_name(cell))
+            found = kept.get(key) if kept is not None and key is not None else None
+            if found is None:
+                todo.append(cell)
+            else:
+                outcome = Outcome(*_name(cell), *found)
+                advance(outcome)
+                yield outcome
+        with closing(_spread(todo, protocol, n_jobs)) as outcomes:
+            for outcome in outcomes:
+                key = keys.get((outcome.method, outcome.demonstration, outcome.seed))
+                if kept is not None and key is not None and not outcome.rows[0]["error"]:
+                    kept.put(key, outcome.rows, outcome.paths)
+                advance(outcome)
+                yield outcome
+
+
+def _spread(cells: list[Cell], protocol: Protocol, n_jobs: int | None) -> Generator[Outcome, None, None]:
+    """The outcomes as they end, from joblib's workers, wherever they are."""
     joblib = _studies("joblib")
     if n_jobs is None and joblib.parallel.get_active_backend()[1] is None:
         n_jobs = -1
     parallel = joblib.Parallel(n_jobs=n_jobs, return_as="generator_unordered", batch_size=1)
-    with _bar(len(cells)) if progress else nullcontext(lambda outcome: None) as advance:
-        for outcome in parallel(joblib.delayed(evaluate)(cell, protocol) for cell in cells):
-            advance(outcome)
-            yield outcome
+    outcomes: Generator[Outcome, None, None] = parallel(joblib.delayed(evaluate)(cell, protocol) for cell in cells)
+    return outcomes
+
+
+def _name(cell: Cell) -> tuple[str, str, int]:
+    return cell.method, cell.demonstration.name, cell.seed
+
+
+def _key(cell: Cell, protocol: Protocol) -> str | None:
+    """What a finished cell is known by; None for a method that cannot even be made."""
+    try:
+        with _alone(cell.seed):
+            ds = _build(cell)
+    except Exception:
+        return None
+    shown = cell.demonstration
+    return fingerprint(cell.method, ds, shown.positions, shown.dt, shown.name, cell.seed, protocol)
 
 
 def evaluate(cell: Cell, protocol: Protocol) -> Outcome:
