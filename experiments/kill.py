@@ -60,8 +60,8 @@ def main(
                 if len(store) != len(cells(n_seeds)):
                     raise SystemExit(f"kill: expected {len(cells(n_seeds))} cells in the file, got {len(store)}")
     print(
-        f"{survived} runs killed in {rounds} files of {len(cells(n_seeds))} cells: every file opened, no cell lost or double, "
-        f"all {len(undisturbed)} rows equal to those of an undisturbed run"
+        f"{survived} runs killed in {rounds} files of {len(cells(n_seeds))} cells: every file opened, no cell lost or "
+        f"double, all {len(undisturbed)} rows equal to those of an undisturbed run"
     )
 
 

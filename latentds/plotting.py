@@ -138,10 +138,10 @@ def dtw_bars(rows: pd.DataFrame, title: str = "") -> Figure:
     figure = Figure(figsize=(2.5 + 1.25 * len(motions), 4.2), dpi=DPI, layout="constrained")
     axes = figure.add_subplot()
     width = 0.82 / len(methods)
-    groups = scored.groupby(["method", "demonstration"])["dtw"]
+    groups = {key: group.dropna().to_numpy() for key, group in scored.groupby(["method", "demonstration"])["dtw"]}
     for i, method in enumerate(methods):
         place = np.arange(len(motions)) + (i - (len(methods) - 1) / 2) * width
-        scores = [groups.get_group((method, motion)).dropna().to_numpy() for motion in motions]
+        scores = [groups.get((method, motion), np.empty(0)) for motion in motions]
         means = np.array([s.mean() if len(s) else np.nan for s in scores])
         spread = np.array([s.std(ddof=1) if len(s) > 1 else 0.0 for s in scores])
         axes.bar(place, means, 0.92 * width, color=color_of(method), alpha=0.8, label=method)

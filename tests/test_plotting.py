@@ -77,6 +77,14 @@ def test_dtw_bars_survives_a_method_that_failed():
     assert painted(plotting.dtw_bars(rows)).min() < 255
 
 
+def test_dtw_bars_leaves_room_for_what_is_not_done():
+    rows = pd.DataFrame(
+        [("a", "x", 1, 2.0), ("a", "y", 1, 3.0), ("b", "y", 1, 4.0)],
+        columns=["method", "demonstration", "start", "dtw"],
+    )
+    assert len(plotting.dtw_bars(rows).axes[0].patches) == 4
+
+
 def test_joints_has_a_row_per_coordinate():
     rng = np.random.default_rng(0)
     shown = Demonstration(rng.standard_normal((40, 7)).cumsum(axis=0), 0.01, "arm")
