@@ -57,14 +57,14 @@ def assert_equal(fast, slow, dtype=torch.float64):
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("dim", [1, 2, 3, 7])
 def test_both_paths_agree(operation, dtype, dim):
-    psi, points = random_map(dim, dtype=dtype), random_points(300, dim, dtype=dtype)
+    psi, points = random_map(dim, dtype=dtype), random_points(1100, dim, dtype=dtype)
     assert kernels.serves(psi, points)
     assert_equal(*both(lambda: getattr(psi, operation)(points)), dtype)
 
 
 @pytest.mark.parametrize("dim", [1, 3])
 def test_tangents_agree(dim):
-    psi, points, tangents = random_map(dim), random_points(300, dim), random_points(300, dim, seed=2)
+    psi, points, tangents = random_map(dim), random_points(1100, dim), random_points(1100, dim, seed=2)
 
     def linearized():
         x, push = psi.linearize(points)
@@ -84,7 +84,7 @@ def test_tangents_agree(dim):
         random_points(2, 0, 3),
         random_points(1, 3),
         random_points(9, 3),
-        random_points(127, 3),
+        random_points(1029, 3),
         random_points(4, 1, 5, 3),
         random_points(3, 20).T,
         random_points(20, 6)[::2, ::2],
@@ -367,6 +367,6 @@ def test_warmup_compiles_everything(capsys):
     ds.controller()(np.zeros(2))
     capsys.readouterr()
     with torch.no_grad():
-        for points in (random_points(2), random_points(300, 2)):
+        for points in (random_points(2), random_points(1100, 2)):
             ds(points), ds.jacobian(points)
     assert capsys.readouterr().err == ""

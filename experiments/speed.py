@@ -1,0 +1,469 @@
+"""How near to the machine's limit: every public call against a plain torch loop and a measured floor, on one core.
+
+    python -m experiments.speed [--quick] [--out results/speed]
+
+Rivals take turns, and what counts are ratios of medians, in CPU time of the one thread that computes: other processes
+then slow both through shared caches only, where in wall time they would interrupt the longer call more often than the
+shorter one. A control loop's latency is wall time, interruptions included, so run this on an otherwise idle machine.
+Leaves goals.csv, growth.csv, summary.md, growth.png and environment.json in ``--out``.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numba
+import numpy as np
+import pandas as pd
+import torch
+import typer
+from rich.console import Console
+from rich.markdown import Markdown
+from scipy.integrate import solve_ivp
+from scipy.optimize import minimize_scalar
+from torch import Tensor, nn
+
+from baselines import SDSEF
+from experiments import report
+from latentds import ChebyshevDS, datasets, kernels
+from latentds.diffeomorphism import WIDTH_BOUND
+from latentds.embedding import chebyshev_columns, place
+from latentds.lanes import WIDTH, load, store
+from latentds.matching import match
+
+N_LAYERS = 150
+SHOWN = datasets.unstable_spiral(7)
+
+# --- the rivals, as one writes them first -----------------------------------------------------------------------------
+
+Loop = list[tuple[Tensor, Tensor, Tensor]]
+"""(c, v, ρ) of every layer."""
+
+
+def loop_of(ds: ChebyshevDS) -> Loop:
+    psi = ds.diffeomorphism
+    return list(zip(*(part.detach() for part in (psi.centers, psi.directions, psi.widths)), strict=True))
+
+
+def loop_forward(layers: Loop, x: Tensor) -> Tensor:
+    for c, v, rho in layers:
+        x = x + torch.exp(-(rho**2) * ((x - c) ** 2).sum(-1, keepdim=True)) * v
+    return x
+
+
+def loop_inverse(layers: Loop, y: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+    """x, and the gradient of each layer's weight with its direction, last layer first."""
+    steps = []
+    for c, v, rho in reversed(layers):
+        w = y - c
+        a, b, r = v @ v, (w * v).sum(-1, keepdim=True), (w * w).sum(-1, keepdim=True)
+        low, high, s = torch.zeros_like(b), torch.ones_like(b), torch.exp(-(rho**2) * r)
+        for _ in range(60):
+            k = torch.exp(-(rho**2) * (a * s * s - 2 * b * s + r))
+            gap = s - k
+            low, high = torch.where(gap < 0, s, low), torch.where(gap > 0, s, high)
+            new = s - gap / (1 - 2 * rho**2 * (b - a * s) * k)
+            new = torch.where((new < low) | (new > high), (low + high) / 2, new)
+            moved, s = (new - s).abs().max(), new
+            if moved < 1e-15:
+                break
+        y = y - s * v
+        steps.append((-2 * rho**2 * s * (y - c), v))
+    return y, steps
+
+
+def loop_velocity(layers: Loop, y: Tensor, latent_velocity: Callable[[Tensor], Tensor]) -> Tensor:
+    x, steps = loop_inverse(layers, y)
+    velocity = latent_velocity(x)
+    for gradient, v in reversed(steps):
+        velocity = velocity + (gradient * velocity).sum(-1, keepdim=True) * v
+    return velocity
+
+
+def runge_kutta(velocity: Callable[[Tensor], Tensor], y: Tensor, times: Tensor) -> Tensor:
+    path = [y]
+    for h in times.diff():
+        k1 = velocity(y)
+        k2 = velocity(y + h / 2 * k1)
+        k3 = velocity(y + h / 2 * k2)
+        k4 = velocity(y + h * k3)
+        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        path.append(y)
+    return torch.stack(path, dim=-2)
+
+
+def loop_match(x: np.ndarray, y: np.ndarray, n_layers: int, beta: float, mu: float) -> float:
+    """Greedy matching, one bounded scalar minimisation a layer; the mean squared error that it reaches."""
+    for _ in range(n_layers):
+        error = y - x
+        worst = int((error**2).sum(1).argmax())
+        v, squared = beta * error[worst], ((x - x[worst]) ** 2).sum(1)
+
+        def loss(rho: float, v: np.ndarray = v, squared: np.ndarray = squared, error: np.ndarray = error) -> float:
+            return float(((error - np.exp(-(rho**2) * squared)[:, None] * v) ** 2).sum())
+
+        rho = minimize_scalar(loss, bounds=(0, mu * WIDTH_BOUND / np.linalg.norm(v)), method="bounded").x
+        x = x + np.exp(-(rho**2) * squared)[:, None] * v
+    return float(((x - y) ** 2).mean())
+
+
+# --- the floor --------------------------------------------------------------------------------------------------------
+
+
+@numba.njit(**kernels.OPTIONS)
+def exponentials(buffer: np.ndarray, repeats: int) -> None:
+    """One exponential for each of ``BLOCK`` numbers in the L1 cache."""
+    for _ in range(repeats):
+        for u in range(0, kernels.BLOCK, WIDTH):
+            store(buffer, u, kernels._exp(load(buffer, u, WIDTH) * -1.0))
+
+
+@numba.njit(**kernels.OPTIONS)
+def products(buffer: np.ndarray, repeats: int) -> None:
+    """Twelve independent chains of multiply-add in registers."""
+    m = load(buffer, 0, WIDTH)
+    a, b, c, d, e, f = m, m, m, m, m, m
+    g, h, i, j, k, n = m, m, m, m, m, m
+    for _ in range(repeats):
+        a, b, c, d, e, f = a * m + m, b * m + m, c * m + m, d * m + m, e * m + m, f * m + m
+        g, h, i, j, k, n = g * m + m, h * m + m, i * m + m, j * m + m, k * m + m, n * m + m
+    store(buffer, 0, a + b + c + d + e + f + g + h + i + j + k + n)
+
+
+def operations(dim: int) -> int:
+    """Vector operations of a layer beside its exponential: x - c, the squared length, times ρ², and x + k v."""
+    return dim + dim + 1 + dim
+
+
+# --- timing -----------------------------------------------------------------------------------------------------------
+
+
+def take_turns(rivals: dict[str, Callable[[], Any]], rounds: int, share: float = 0.02) -> dict[str, np.ndarray]:
+    """CPU seconds a call, (rounds,) each: in each round, each rival runs for about ``share`` s, once at least."""
+    counts = {}
+    for name, call in rivals.items():
+        call()
+        began = time.thread_time()
+        call()
+        counts[name] = max(1, int(share / max(time.thread_time() - began, 1e-7)))
+    seconds: dict[str, list[float]] = {name: [] for name in rivals}
+    for _ in range(rounds):
+        for name, call in rivals.items():
+            began = time.thread_time()
+            for _ in range(counts[name]):
+                call()
+            seconds[name].append((time.thread_time() - began) / counts[name])
+    return {name: np.array(values) for name, values in seconds.items()}
+
+
+class Goal(NamedTuple):
+    """One line of the table: ``low`` and ``high`` are quartiles over the rounds."""
+
+    what: str
+    unit: str
+    goal: str
+    reached: float
+    low: float
+    high: float
+    met: bool
+    note: str = ""
+
+    @classmethod
+    def of(
+        cls, what: str, unit: str, bound: float, values: np.ndarray, *, at_most: bool = False, note: str = ""
+    ) -> Goal:
+        reached, low, high = (float(np.quantile(values, q)) for q in (0.5, 0.25, 0.75))
+        met = reached <= bound if at_most else reached >= bound
+        return cls(what, unit, f"{'≤' if at_most else '≥'} {bound:g}", reached, low, high, met, note)
+
+    @classmethod
+    def ratio(cls, what: str, least: float, slow: np.ndarray, fast: np.ndarray) -> Goal:
+        """Of medians, with the quartiles of the ratio round by round."""
+        line = cls.of(what, "times faster", least, slow / fast)
+        reached = float(np.median(slow) / np.median(fast))
+        note = f"{_time(np.median(slow))} against {_time(np.median(fast))}"
+        return line._replace(reached=reached, met=reached >= least, note=note)
+
+
+def _time(seconds: float) -> str:
+    return next(
+        f"{seconds * scale:.3g} {unit}" for unit, scale in (("s", 1), ("ms", 1e3), ("µs", 1e6)) if seconds * scale >= 1
+    )
+
+
+# --- studies ----------------------------------------------------------------------------------------------------------
+
+
+def latent_points(ds: ChebyshevDS, count: int, seed: int = 0) -> Tensor:
+    """Spread around the motion: as rollouts from everywhere near it would visit."""
+    generator = torch.Generator().manual_seed(seed)
+    on_path = ds.encode(SHOWN.positions)[torch.randint(len(SHOWN), (count,), generator=generator)]
+    return on_path + 0.3 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+
+
+def against_floor(ds: ChebyshevDS, rounds: int) -> list[Goal]:
+    layers, x = loop_of(ds), latent_points(ds, 100_000)
+    buffer, repeats = np.full(kernels.BLOCK, 0.5), 20_000
+    times = take_turns(
+        {
+            "decode": lambda: ds.decode(x),
+            "exponentials": lambda: exponentials(buffer, repeats),
+            "products": lambda: products(buffer, repeats),
+        },
+        rounds,
+    )
+    each_exp = times["exponentials"] / repeats / kernels.BLOCK
+    each_product = times["products"] / repeats / 12 / WIDTH
+    floor = (each_exp + operations(3) * each_product) * N_LAYERS * len(x)
+    loop = take_turns({"decode": lambda: ds.decode(x), "loop": lambda: loop_forward(layers, x)}, max(3, rounds // 4))
+    note = (
+        f"floor {np.median(floor) / N_LAYERS / len(x) * 1e9:.2f} ns a layer and point: exponential "
+        f"{np.median(each_exp) * 1e9:.2f} ns, {operations(3)} operations of {np.median(each_product) * 1e9:.3f} ns"
+    )
+    return [
+        Goal.of("decode 10⁵ points", "times the floor", 2.5, times["decode"] / floor, at_most=True, note=note),
+        Goal.ratio("decode 10⁵ points, torch loop", 35, loop["loop"], loop["decode"]),
+    ]
+
+
+def against_loop(ds: ChebyshevDS, rounds: int) -> list[Goal]:
+    layers, many = loop_of(ds), ds.decode(latent_points(ds, 1000))
+    one = SHOWN.positions[400]
+
+    def latent_velocity(x: Tensor) -> Tensor:
+        return ds.dynamics(x, x)
+
+    for points in (many, one):
+        torch.testing.assert_close(ds(points), loop_velocity(layers, points, latent_velocity), rtol=1e-8, atol=1e-8)
+    goals = []
+    for label, points, least in (("velocity of 1000 points", many, 80), ("velocity of one point, ds(y)", one, 100)):
+        times = take_turns(
+            {"fast": lambda p=points: ds(p), "loop": lambda p=points: loop_velocity(layers, p, latent_velocity)}, rounds
+        )
+        goals.append(Goal.ratio(f"{label}, torch loop", least, times["loop"], times["fast"]))
+    return goals
+
+
+def control_loop(calls: int) -> list[Goal]:
+    goals = []
+    for n_layers, most in ((150, 60), (750, 120)):
+        controller = ChebyshevDS(3, n_layers=n_layers).fit(SHOWN).controller()
+        points, out = SHOWN.positions.numpy(), np.empty(3)
+        seconds = np.empty(calls)
+        for i in range(calls):
+            y = points[i % len(points)]
+            began = time.perf_counter()
+            controller(y, out)
+            seconds[i] = time.perf_counter() - began
+        micro = seconds * 1e6
+        label = f"controller(y), M = {n_layers}"
+        goals.append(Goal.of(f"{label}, median", "µs", most, micro, at_most=True))
+        late = float(np.quantile(micro, 0.99))
+        note = f"worst of {calls}: {micro.max():.0f} µs"
+        goals.append(Goal(f"{label}, 99th percentile", "µs", "≤ 1000", late, late, late, late <= 1000, note))
+    return goals
+
+
+def rollouts(ds: ChebyshevDS, rounds: int) -> list[Goal]:
+    generator = torch.Generator().manual_seed(0)
+    starts = SHOWN.start + 0.1 * torch.randn(16, 3, generator=generator, dtype=torch.float64)
+    times = torch.linspace(0, SHOWN.duration, 1000, dtype=torch.float64)
+    clock = take_turns(
+        {"fast": lambda: ds.rollout(starts, times), "rk4": lambda: runge_kutta(ds, starts, times)}, max(3, rounds // 4)
+    )
+    controller = ds.controller()
+    found = ds.rollout(starts, times)
+    began, worst = time.thread_time(), 0.0
+    for start, path in zip(starts.numpy(), found.numpy(), strict=True):
+        exact = solve_ivp(
+            lambda _, y: controller(y), (0, SHOWN.duration), start, "RK45", times.numpy(), rtol=1e-9, atol=1e-12
+        )
+        worst = max(worst, float(np.abs(exact.y.T - path).max()))
+    seconds = np.array([time.thread_time() - began])
+    coarse = float((runge_kutta(ds, starts, times) - found).abs().max())
+    return [
+        Goal.ratio("rollout 16 x 1000, RK4 on ds(y)", 60, clock["rk4"], clock["fast"]),
+        Goal.ratio("rollout 16 x 1000, dopri5 on controller(y)", 60, seconds, clock["fast"]),
+        Goal.of(
+            "rollout, distance from dopri5 (rtol 1e-9)",
+            "units",
+            1e-6,
+            np.array([worst]),
+            at_most=True,
+            note=f"RK4 of 1000 steps: {coarse:.1e}",
+        ),
+    ]
+
+
+def fits(rounds: int) -> list[Goal]:
+    y = SHOWN.positions.numpy()
+    x = place(chebyshev_columns(len(y), 3)[::-1], y[0], y[-1])
+    slow: list[float] = []
+    times = take_turns(
+        {"fast": lambda: match(x, y, 300, 0.5, 0.9), "bounded": lambda: slow.append(loop_match(x, y, 300, 0.5, 0.9))},
+        max(3, rounds // 4),
+    )
+    psi = ChebyshevDS(3, n_layers=300).diffeomorphism
+    psi.assign(*(torch.from_numpy(part) for part in match(x, y, 300, 0.5, 0.9)))
+    error = float((psi(torch.from_numpy(x)) - SHOWN.positions).square().mean())
+    note = f"MSE {error:.3g} against {slow[-1]:.3g}"
+    return [
+        Goal.ratio("fit, M = 300, N = 1000, bounded scalar search", 30, times["bounded"], times["fast"]),
+        Goal.of(
+            "fit, MSE over that of the bounded search",
+            "ratio",
+            1,
+            np.array([error / slow[-1]]),
+            at_most=True,
+            note=note,
+        ),
+    ]
+
+
+def sdsef_step(rounds: int) -> list[Goal]:
+    ds = SDSEF(3, n_layers=10, n_features=150, seed=0).float()
+    psi, network = ds.diffeomorphism, ds.dynamics.network
+    with torch.no_grad():
+        for parameter in psi.parameters():
+            parameter.copy_(0.01 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0)))
+    points, wanted = SHOWN.positions.float(), SHOWN.velocities.float()
+    compiled = psi.compiled_linearize()
+    optimizer = torch.optim.Adam(ds.parameters(), lr=0.0)
+
+    def heading(x: Tensor) -> Tensor:
+        z = x - x[-1]
+        return z / z.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+
+    def back_sweep() -> Tensor:
+        x, push = compiled(points)
+        return push(heading(x))
+
+    def inverted() -> Tensor:
+        u = points.clone().requires_grad_()
+        x = psi.inverse(u)
+        rows = [torch.autograd.grad(x[:, i].sum(), u, create_graph=True)[0] for i in range(3)]
+        return torch.linalg.solve(torch.stack(rows, dim=1), heading(x).unsqueeze(-1)).squeeze(-1)
+
+    def step(direction: Callable[[], Tensor]) -> Tensor:
+        optimizer.zero_grad()
+        loss = nn.functional.smooth_l1_loss(-network(points).exp() * direction(), wanted)
+        loss.backward()
+        optimizer.step()
+        return torch.cat([p.grad.flatten() for p in psi.parameters()])
+
+    with torch.enable_grad():
+        torch.testing.assert_close(step(back_sweep), step(inverted), rtol=1e-2, atol=1e-4)
+        times = take_turns({"fast": lambda: step(back_sweep), "inverted": lambda: step(inverted)}, rounds)
+    return [Goal.ratio("SDS-EF training step, J by autograd and solve", 6, times["inverted"], times["fast"])]
+
+
+def growth(quick: bool) -> pd.DataFrame:
+    """Seconds of each call as N or M grows, and the exponent of the last decade or so."""
+    rows = []
+    ds = ChebyshevDS(3, n_layers=N_LAYERS).fit(SHOWN)
+    for count in (1, 10, 100, 1000, 10_000, 100_000) if quick else (1, 10, 100, 1000, 10_000, 100_000, 1_000_000):
+        x = latent_points(ds, count)
+        y = ds.decode(x)
+        calls = {"decode": lambda x=x: ds.decode(x), "encode": lambda y=y: ds.encode(y), "velocity": lambda y=y: ds(y)}
+        for call, values in take_turns(calls, 5).items():
+            rows.append(("N", call, count, float(np.median(values))))
+    for n_layers in (25, 50, 100, 200, 400, 800):
+        ds = ChebyshevDS(3, n_layers=n_layers).fit(SHOWN)
+        y = ds.decode(latent_points(ds, 10_000))
+        calls = {"velocity": lambda ds=ds, y=y: ds(y), "fit": lambda ds=ds: ds.fit(SHOWN)}
+        for call, values in take_turns(calls, 3).items():
+            rows.append(("M", call, n_layers, float(np.median(values))))
+    for count in (125, 250, 500, 1000, 2000, 4000, 8000):
+        shown = datasets.unstable_spiral(7, count)
+        points = shown.positions.numpy()
+        x = place(chebyshev_columns(count, 3)[::-1], points[0], points[-1])
+        values = take_turns({"match": lambda x=x, p=points: match(x, p, N_LAYERS, 0.5, 0.9)}, 5)["match"]
+        rows.append(("N", "match", count, float(np.median(values))))
+    return pd.DataFrame(rows, columns=["grows", "call", "size", "seconds"])
+
+
+def exponents(curves: pd.DataFrame) -> pd.DataFrame:
+    """Of seconds ∝ size^p between the largest size and one about eight times smaller."""
+    rows = []
+    for (grows, call), curve in curves.groupby(["grows", "call"]):
+        last = curve.iloc[-1]
+        first = curve[curve["size"] <= last["size"] / 8].iloc[-1]
+        power = math.log(last["seconds"] / first["seconds"]) / math.log(last["size"] / first["size"])
+        rows.append((grows, call, int(first["size"]), int(last["size"]), power))
+    return pd.DataFrame(rows, columns=["grows", "call", "from", "to", "exponent"])
+
+
+def draw(curves: pd.DataFrame, path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    for axis, (grows, label) in zip(figure.subplots(1, 2), (("N", "points N"), ("M", "layers M")), strict=True):
+        for call, curve in curves[curves["grows"] == grows].groupby("call"):
+            axis.loglog(curve["size"], curve["seconds"], "o-", label=call, markersize=3)
+        axis.set(xlabel=label, ylabel="seconds")
+        axis.xaxis.set_minor_formatter("")
+        axis.grid(alpha=0.3)
+        axis.legend(frameon=False)
+    figure.savefig(path, dpi=150)
+
+
+def main(
+    quick: Annotated[bool, typer.Option(help="Fewer rounds and no million points: under a minute.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for tables, curves and the picture.")] = Path("results/speed"),
+) -> None:
+    """Measure every public call against a torch loop and a measured floor, on one core."""
+    torch.set_num_threads(1)
+    torch.set_grad_enabled(False)
+    console, rounds = Console(), 9 if quick else 41
+    kernels.warmup([3])
+    ds = ChebyshevDS(3, n_layers=N_LAYERS).fit(SHOWN)
+    goals = [
+        *against_floor(ds, rounds),
+        *against_loop(ds, rounds),
+        *control_loop(2000 if quick else 20_000),
+        *rollouts(ds, rounds),
+        *fits(rounds),
+        *sdsef_step(rounds),
+    ]
+    curves = growth(quick)
+    summary = "\n\n".join(
+        [
+            f"Load average while it ran: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; 1 core is used.",
+            report.table(
+                ("What", "Goal", "Reached", "Quartiles", "Unit", "Met", "Note"),
+                [
+                    (
+                        g.what,
+                        g.goal,
+                        f"{g.reached:.3g}",
+                        f"{g.low:.3g} to {g.high:.3g}",
+                        g.unit,
+                        "yes" if g.met else "NO",
+                        g.note,
+                    )
+                    for g in goals
+                ],
+            ),
+            report.table(
+                ("Grows", "Call", "From", "To", "Exponent of the time"),
+                [(*map(str, row[:-1]), f"{row[-1]:.2f}") for row in exponents(curves).itertuples(index=False)],
+            ),
+        ]
+    )
+    out.mkdir(parents=True, exist_ok=True)
+    report.write(out / "goals.csv", pd.DataFrame(goals).to_csv(index=False))
+    report.write(out / "growth.csv", curves.to_csv(index=False))
+    report.write(out / "summary.md", summary + "\n")
+    report.write(out / "environment.json", report.environment())
+    draw(curves, out / "growth.png")
+    console.print(Markdown(summary))
+    console.print(f"{out}: summary.md, goals.csv, growth.csv, growth.png, environment.json")
+
+
+if __name__ == "__main__":
+    typer.run(main)
