@@ -38,6 +38,7 @@ class FDM(LatentDS):
         super().__init__(
             dim, LocallyWeightedTranslations(dim, n_layers), RayDynamics(dim, PiecewiseLinearLaw.uniform())
         )
+        self.n_layers = self.diffeomorphism.n_layers
         self.beta = number_in(beta, "beta", 0, 1, ends="(]")
         self.mu = number_in(mu, "mu", 0, 1)
         self.steps = whole_number(steps, "steps", at_least=1)

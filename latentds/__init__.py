@@ -3,14 +3,17 @@
 from . import datasets
 from .base import FitReport, LatentDS, StableDS
 from .benchmark import compare
+from .certificate import Certificate, certify
 from .chebyshev import ChebyshevDS
 from .demonstration import Demonstration
 from .diffeomorphism import Diffeomorphism, LocallyWeightedTranslations
-from .tube import TubeDS
 from .kernels import warmup
+from .storage import load
+from .tube import TubeDS
 
 __version__ = "0.1.0"
 __all__ = [
+    "Certificate",
     "ChebyshevDS",
     "Demonstration",
     "Diffeomorphism",
@@ -19,7 +22,9 @@ __all__ = [
     "LocallyWeightedTranslations",
     "StableDS",
     "TubeDS",
+    "certify",
     "compare",
     "datasets",
+    "load",
     "warmup",
 ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,6 +34,7 @@ class FitReport:
         seconds: wall time of the fit.
         history: loss per epoch, for methods that learn by gradient.
         notes: what the user should know of this fit (early stop, divergence handled, choices made).
+        learned_from: name and SHA-256 of each demonstration.
     """
 
     mse: float
@@ -39,6 +42,7 @@ class FitReport:
     seconds: float
     history: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()
+    learned_from: tuple[tuple[str, str], ...] = ()
 
 
 class StableDS(nn.Module, ABC):
@@ -87,6 +91,17 @@ class StableDS(nn.Module, ABC):
         from .controller import Controller
 
         return Controller(self)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The constructor's arguments; each is an attribute of the same name, as it is in scikit-learn."""
+        return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write one file that :func:`latentds.load` reads, atomically; see :mod:`latentds.storage`."""
+        from .storage import save
+
+        save(self, path)
 
     def _points(self, y: Any, name: str = "y") -> tuple[Tensor, torch.dtype]:
         """``y`` in the module's dtype, and the dtype in which the caller wants the answer."""

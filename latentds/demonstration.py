@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import secrets
 from collections.abc import Sequence
@@ -87,6 +88,12 @@ class Demonstration:
     def size(self) -> float:
         """Largest extent along a coordinate axis, in the units of the positions."""
         return float((self.positions.amax(0) - self.positions.amin(0)).max())
+
+    @property
+    def fingerprint(self) -> tuple[str, str]:
+        """Its name, and a SHA-256 of its positions and dt that tells it from any other."""
+        digest = hashlib.sha256(np.array([self.dim, self.dt]).tobytes() + self.positions.numpy().tobytes())
+        return self.name, digest.hexdigest()
 
     @classmethod
     def from_times(cls, times: Any, positions: Any, name: str = "") -> Demonstration:

@@ -93,4 +93,5 @@ def settle(
         ds.attractor.copy_(shown.goal)
         dynamics.aim(psi.inverse(shown.start.to(ds.attractor)), psi.inverse(ds.attractor))
         missed = psi(torch.from_numpy(latent).to(ds.attractor)) - shown.positions.to(ds.attractor)
-    ds.fit_report = FitReport(float(missed.square().mean()), psi.n_layers, time.perf_counter() - began)
+    mse, seconds = float(missed.square().mean()), time.perf_counter() - began
+    ds.fit_report = FitReport(mse, psi.n_layers, seconds, learned_from=(shown.fingerprint,))

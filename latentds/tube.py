@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -86,12 +86,14 @@ class TubeDS(LatentDS):
     def __init__(self, dim: int, *, n_layers: int = 300, contraction: float = 20.0, refined: bool = True) -> None:
         along, across = PiecewiseLinearLaw.uniform(), PiecewiseLinearLaw(torch.ones(1), torch.ones(1))
         super().__init__(dim, LocallyWeightedTranslations(dim, n_layers), TubeDynamics(dim, along, across))
+        self.n_layers = self.diffeomorphism.n_layers
         self.contraction = number_in(contraction, "contraction", 0, float("inf"))
         self.refined = bool(refined)
 
     def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> TubeDS:
         began = time.perf_counter()
-        shown, spread = mean_motion(demonstrations_of(demonstration, self.dim))
+        every = demonstrations_of(demonstration, self.dim)
+        shown, spread = mean_motion(every)
         path, way, times = arc_length_path(shown.positions.numpy(), shown.times.numpy(), N_POINTS)
         _refuse_crossings(path)
         law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
@@ -109,7 +111,8 @@ class TubeDS(LatentDS):
                 judged.append((self._score(shown), better))
         best = min(judged, key=lambda pair: pair[0])[1]
         self._lay(best, shown, law)
-        self.fit_report = self._report(best, path, shown, spread, began)
+        report = self._report(best, path, shown, spread, began)
+        self.fit_report = replace(report, learned_from=tuple(one.fingerprint for one in every))
         return self
 
     @property

@@ -1,0 +1,147 @@
+"""Systems in files: safetensors, with JSON beside the numbers. Loading runs and imports nothing that a file names."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from .base import FitReport, StableDS
+from .chebyshev import ChebyshevDS
+from .demonstration import atomic_write
+from .tube import TubeDS
+
+FORMAT = 1
+"""Raised when files change so that an older latentds would misread them."""
+SLACK = 1000
+"""A file may ask for this many times as many numbers as it holds, not more: its sizes are not to be trusted."""
+
+
+def save(ds: StableDS, path: str | os.PathLike[str]) -> None:
+    """Write a system, its constructor's arguments and its fit's report to one file. Atomic.
+
+    Args:
+        ds: a system whose :attr:`~latentds.StableDS.settings` are numbers, strings, booleans or None.
+        path: of the file.
+
+    Raises:
+        ValueError: if ``ds`` is no such system.
+        ImportError: if safetensors is missing; it comes with ``pip install 'latentds[files]'``.
+    """
+    safetensors = _safetensors()
+    if not isinstance(ds, StableDS):
+        raise ValueError(f"ds: expected a StableDS, got {type(ds).__name__}")
+    try:
+        settings = ds.settings
+        text = json.dumps(
+            {"format": FORMAT, "class": type(ds).__name__, "settings": settings, "report": _told(ds.fit_report)}
+        )
+        assert all(isinstance(value, (int, float, str, type(None))) for value in settings.values())
+    except (AttributeError, TypeError, AssertionError) as error:
+        raise ValueError(
+            f"ds: expected plain constructor arguments kept as attributes of the same names, got {error or settings!r}"
+        ) from None
+    state = {name: value.detach().cpu().contiguous() for name, value in ds.state_dict().items()}
+    with atomic_write(path) as file:
+        file.write(safetensors.torch.save(state, metadata={"latentds": text}))
+
+
+def load(path: str | os.PathLike[str], *, classes: Sequence[type[StableDS]] = ()) -> StableDS:
+    """Read a system that :func:`save` wrote, from a source that need not be trusted.
+
+    Nothing that the file names is imported or run: its class is looked up by name among ChebyshevDS, TubeDS and
+    ``classes``. Whether what was loaded is stable is for :func:`latentds.certify` to say.
+
+    Args:
+        path: of the file.
+        classes: further classes that it may hold, such as those in ``baselines`` or your own.
+
+    Raises:
+        ValueError: if the file is damaged, of another kind, of a newer format, or holds another class.
+        FileNotFoundError: if there is no such file.
+        ImportError: if safetensors is missing; it comes with ``pip install 'latentds[files]'``.
+    """
+    safetensors = _safetensors()
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"path: no such file: {path}")
+    try:
+        with safetensors.safe_open(path, "pt") as file:
+            text = (file.metadata() or {}).get("latentds")
+            state = {name: file.get_tensor(name) for name in file.keys()} if text is not None else {}  # noqa: SIM118
+    except Exception as error:  # safetensors' own errors, and whatever a hostile header provokes
+        raise ValueError(f"path: {path.name} is not a readable safetensors file ({error})") from None
+    known: dict[str, type[StableDS]] = {"ChebyshevDS": ChebyshevDS, "TubeDS": TubeDS}
+    known |= {allowed.__name__: allowed for allowed in classes}
+    if text is None:
+        raise ValueError(f"path: expected a file that latentds wrote, got another safetensors file: {path.name}")
+    try:
+        return _rebuilt(text, state, known)
+    except (KeyError, TypeError, RuntimeError, AttributeError, RecursionError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise ValueError(f"path: {path.name} does not hold a system that can be loaded: {reason}") from None
+
+
+def _rebuilt(text: str, state: dict[str, torch.Tensor], known: dict[str, type[StableDS]]) -> StableDS:
+    told = json.loads(text)
+    if not isinstance(told, dict) or type(told.get("format")) is not int:
+        raise ValueError("expected a format number in its metadata, got none")
+    if told["format"] > FORMAT:
+        raise ValueError(f"expected format {FORMAT} or older, got {told['format']}: it needs a newer latentds")
+    if told["class"] not in known:
+        raise ValueError(
+            f"expected a class among {sorted(known)}, got {told['class']!r:.80}; allow others by classes=[…]"
+        )
+    settings = told["settings"]
+    wanted = inspect.signature(known[told["class"]]).parameters
+    if not isinstance(settings, dict) or not set(settings) <= set(wanted):
+        raise ValueError(f"expected settings among {sorted(wanted)}, got {settings!r:.200}")
+    held = sum(value.numel() for value in state.values())
+    sizes = [v for k, v in settings.items() if (k == "dim" or k.startswith("n_")) and isinstance(v, int)]
+    if math.prod(max(size, 1) for size in sizes) > SLACK * max(held, 1):
+        raise ValueError(f"expected sizes that {held} stored numbers can fill, got {settings!r:.200}")
+    if not all(bool(torch.isfinite(value).all()) for value in state.values() if value.is_floating_point()):
+        raise ValueError("expected finite numbers, got NaN or inf")
+    with torch.random.fork_rng(devices=[]):  # an unseeded constructor draws numbers, only to have them replaced
+        ds = known[told["class"]](**settings)
+    dtype = state["attractor"].dtype
+    if not dtype.is_floating_point:
+        raise ValueError(f"expected a floating attractor, got {dtype}")
+    ds.to(dtype).load_state_dict(state)
+    ds.fit_report = _report(told.get("report"))
+    return ds
+
+
+def _told(report: FitReport | None) -> dict[str, Any] | None:
+    return None if report is None else {part.name: getattr(report, part.name) for part in fields(FitReport)}
+
+
+def _report(told: Any) -> FitReport | None:
+    """The part of a report that every method has; a method's own figures are not kept."""
+    if told is None:
+        return None
+    return FitReport(
+        float(told["mse"]),
+        int(told["n_layers"]),
+        float(told["seconds"]),
+        tuple(float(loss) for loss in told["history"]),
+        tuple(str(note) for note in told["notes"]),
+        tuple((str(name), str(digest)) for name, digest in told["learned_from"]),
+    )
+
+
+def _safetensors() -> Any:
+    try:
+        import safetensors
+        import safetensors.torch
+    except ImportError:
+        raise ImportError("saving and loading need safetensors: pip install 'latentds[files]'") from None
+
+    return safetensors

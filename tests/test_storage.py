@@ -1,0 +1,268 @@
+"""Files of systems: exact, atomic, and harmless whoever wrote them."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import struct
+import subprocess
+import sys
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+import latentds
+from baselines import FDM, SDSEF
+from latentds import ChebyshevDS, Demonstration, StableDS, TubeDS, datasets
+from latentds.storage import FORMAT
+from latentds.testing import wavy_motion
+
+SYSTEMS = {
+    "ChebyshevDS": lambda: ChebyshevDS(3, n_layers=40, beta=0.7, mu=0.8),
+    "FDM": lambda: FDM(3, n_layers=40),
+    "TubeDS": lambda: TubeDS(3, n_layers=40, contraction=7.0, refined=False),
+    "SDSEF": lambda: SDSEF(3, n_layers=3, n_features=7, recipe="official"),
+}
+
+
+def same(a, b):
+    y, times = wavy_motion(3).positions, torch.linspace(0, 1, 3)
+    with torch.no_grad():
+        return torch.equal(a(y), b(y)) and torch.equal(a.rollout(y[:2], times), b.rollout(y[:2], times))
+
+
+@pytest.fixture(params=SYSTEMS, ids=lambda name: name)
+def fitted(request):
+    ds = SYSTEMS[request.param]()
+    return ds if isinstance(ds, SDSEF) else ds.fit(datasets.unstable_spiral(3, 200))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_gives_the_system_back(fitted, tmp_path, dtype):
+    ds = fitted.to(dtype)
+    ds.save(tmp_path / "ds.safetensors")
+    back = latentds.load(tmp_path / "ds.safetensors", classes=[FDM, SDSEF])
+    assert type(back) is type(ds)
+    assert back.settings == ds.settings
+    assert back.attractor.dtype == dtype
+    assert same(back, ds)
+    assert os.listdir(tmp_path) == ["ds.safetensors"]
+
+
+def test_keeps_the_report_and_what_it_was_learned_from(tmp_path):
+    shown = datasets.unstable_spiral(1, 100)
+    ds = TubeDS(3, n_layers=20, refined=False).fit(shown)
+    ds.save(tmp_path / "a")
+    report = latentds.load(tmp_path / "a").fit_report
+    assert (report.mse, report.n_layers, report.seconds) == (ds.fit_report.mse, 20, ds.fit_report.seconds)
+    assert report.learned_from == (shown.fingerprint,) == (("unstable c=1", shown.fingerprint[1]),)
+    ChebyshevDS(2).save(tmp_path / "b")
+    assert latentds.load(tmp_path / "b").fit_report is None
+
+
+def test_fingerprint_tells_demonstrations_apart():
+    shown = wavy_motion(2)
+    other = shown.positions.clone()
+    other[3, 1] += 1e-15 + 1e-15 * other[3, 1].abs()
+    prints = {
+        Demonstration(shown.positions, shown.dt).fingerprint[1],
+        Demonstration(shown.positions, shown.dt * (1 + 1e-15)).fingerprint[1],
+        Demonstration(other, shown.dt).fingerprint[1],
+        Demonstration(shown.positions.reshape(-1, 1), shown.dt).fingerprint[1],
+    }
+    assert len(prints) == 4
+    assert Demonstration(shown.positions, shown.dt, "x").fingerprint == ("x", shown.fingerprint[1])
+
+
+class Mine(StableDS):
+    """A third party's."""
+
+    def __init__(self, dim, *, rate=1.0):
+        super().__init__(dim)
+        self.rate = rate
+
+    def fit(self, demonstration, *, progress=False):
+        return self
+
+    def forward(self, y):
+        return -self.rate * y
+
+    def lyapunov(self, y):
+        return y.square().sum(-1)
+
+    def rollout(self, y0, t):
+        return y0.unsqueeze(-2) * torch.exp(-self.rate * self._times(t)).unsqueeze(-1)
+
+
+def test_third_parties_by_explicit_argument(tmp_path):
+    Mine(2, rate=3.0).save(tmp_path / "mine")
+    assert latentds.load(tmp_path / "mine", classes=[Mine]).rate == 3.0
+    with pytest.raises(
+        ValueError, match=r"expected a class among \['ChebyshevDS', 'TubeDS'\], got 'Mine'; allow others"
+    ):
+        latentds.load(tmp_path / "mine")
+    FDM(2).save(tmp_path / "fdm")
+    with pytest.raises(ValueError, match="got 'FDM'; allow others by classes="):
+        latentds.load(tmp_path / "fdm")
+
+
+class Forgets(Mine):
+    def __init__(self, dim, *, gain=1.0):
+        super().__init__(dim)
+
+
+def test_save_refuses_what_it_could_not_load(tmp_path):
+    for ds in (Forgets(2), Mine(2, rate=torch.ones(1)), Mine(2, rate=[1.0])):
+        with pytest.raises(ValueError, match="ds: expected plain constructor arguments kept as attributes"):
+            ds.save(tmp_path / "a")
+    assert not os.listdir(tmp_path)
+
+
+def written(path, *, state=None, text=None, **changes):
+    """A genuine file with its metadata or its tensors changed."""
+    ds = ChebyshevDS(2, n_layers=3)
+    told = {"format": FORMAT, "class": "ChebyshevDS", "settings": ds.settings, "report": None} | changes
+    told = {key: value for key, value in told.items() if value is not ...}
+    tensors = ds.state_dict() | (state or {})
+    tensors = {name: value.clone() for name, value in tensors.items() if value is not ...}
+    save_file(tensors, path, metadata={"latentds": json.dumps(told) if text is None else text})
+
+
+def damage(path, change):
+    written(path)
+    path.write_bytes(change(path.read_bytes()))
+
+
+class Explosive:
+    def __reduce__(self):
+        return os.mkdir, ("exploded",)
+
+
+def with_header(change):
+    def apply(data):
+        size = struct.unpack("<Q", data[:8])[0]
+        header = json.loads(data[8 : 8 + size])
+        change(header)
+        packed = json.dumps(header).encode()
+        return struct.pack("<Q", len(packed)) + packed + data[8 + size :]
+
+    return apply
+
+
+def settings(**changes):
+    return ChebyshevDS(2, n_layers=3).settings | changes
+
+
+BAD = {
+    "pickle": (lambda p: p.write_bytes(pickle.dumps(Explosive())), "not a readable safetensors file"),
+    "torch.save": (lambda p: torch.save({"a": Explosive()}, p), "not a readable safetensors file"),
+    "empty": (lambda p: p.write_bytes(b""), "not a readable safetensors file"),
+    "text": (lambda p: p.write_text("hello, world" * 10), "not a readable safetensors file"),
+    "truncated": (lambda p: damage(p, lambda data: data[:-8]), "not a readable safetensors file"),
+    "truncated header": (lambda p: damage(p, lambda data: data[:100]), "not a readable safetensors file"),
+    "longer": (lambda p: damage(p, lambda data: data + b"\0" * 8), "not a readable safetensors file"),
+    "huge header": (
+        lambda p: damage(p, lambda data: struct.pack("<Q", 2**62) + data[8:]),
+        "not a readable safetensors file",
+    ),
+    "huge tensor": (
+        lambda p: damage(p, with_header(lambda h: h["attractor"].update(shape=[2**60]))),
+        "not a readable safetensors file",
+    ),
+    "tensor outside": (
+        lambda p: damage(p, with_header(lambda h: h["attractor"].update(data_offsets=[0, 2**50]))),
+        "not a readable safetensors file",
+    ),
+    "someone else's": (lambda p: save_file({"a": torch.ones(2)}, p), "expected a file that latentds wrote"),
+    "no JSON": (lambda p: written(p, text="{"), "does not hold a system"),
+    "deep JSON": (lambda p: written(p, text="[" * 100_000), "does not hold a system"),
+    "a list": (lambda p: written(p, text="[1, 2]"), "expected a format number in its metadata"),
+    "no format": (lambda p: written(p, format=...), "expected a format number in its metadata"),
+    "newer": (lambda p: written(p, format=FORMAT + 1), f"got {FORMAT + 1}: it needs a newer latentds"),
+    "no class": (lambda p: written(p, **{"class": ...}), "does not hold a system .* 'class'"),
+    "a module's class": (lambda p: written(p, **{"class": "os.system"}), "expected a class among .*, got 'os.system'"),
+    "unhashable class": (lambda p: written(p, **{"class": ["FDM"]}), "does not hold a system"),
+    "no settings": (lambda p: written(p, settings=...), "does not hold a system .* 'settings'"),
+    "odd settings": (lambda p: written(p, settings=[2]), "expected settings among"),
+    "unknown setting": (lambda p: written(p, settings=settings(callback="os.system")), "expected settings among"),
+    "bad setting": (lambda p: written(p, settings=settings(beta=7)), "beta: expected a number in"),
+    "absurd dim": (
+        lambda p: written(p, settings=settings(dim=10**12)),
+        "expected sizes that .* stored numbers can fill",
+    ),
+    "absurd layers": (lambda p: written(p, settings=settings(n_layers=10**9)), "expected sizes that .* can fill"),
+    "endless number": (lambda p: written(p, settings=settings(n_layers=10**400)), "does not hold a system"),
+    "other dim": (lambda p: written(p, settings=settings(dim=3)), "size mismatch for attractor"),
+    "missing tensor": (lambda p: written(p, state={"dynamics.length": ...}), "Missing key"),
+    "missing attractor": (lambda p: written(p, state={"attractor": ...}), "attractor"),
+    "extra tensor": (lambda p: written(p, state={"extra": torch.ones(3)}), "Unexpected key"),
+    "wrong shape": (lambda p: written(p, state={"attractor": torch.ones(2, 2)}), "size mismatch for attractor"),
+    "whole numbers": (
+        lambda p: written(p, state={"attractor": torch.ones(2, dtype=torch.int64)}),
+        "floating attractor",
+    ),
+    "nan": (lambda p: written(p, state={"attractor": torch.full((2,), torch.nan)}), "expected finite numbers, got NaN"),
+    "bad report": (lambda p: written(p, report={"mse": "x"}), "does not hold a system"),
+    "odd report": (lambda p: written(p, report=[1]), "does not hold a system"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_files(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    write, message = BAD[name]
+    write(tmp_path / "bad")
+    with pytest.raises(ValueError, match=f"path: .*{message}"):
+        latentds.load("bad")
+    assert os.listdir(tmp_path) == ["bad"]
+
+
+def test_a_law_whose_knots_do_not_increase_is_refused(tmp_path):
+    ds = TubeDS(2, n_layers=3)
+    ds.save(tmp_path / "a")
+    state = load_file(tmp_path / "a")
+    state["dynamics.law.knots"] = torch.tensor([0.5, 0.1])
+    state["dynamics.law.speeds"] = torch.tensor([1.0, 1.0])
+    told = {"format": FORMAT, "class": "TubeDS", "settings": ds.settings, "report": None}
+    save_file(state, tmp_path / "a", metadata={"latentds": json.dumps(told)})
+    with pytest.raises(ValueError, match="knots: expected"):
+        latentds.load(tmp_path / "a")
+
+
+def test_every_truncation_is_a_clear_error(tmp_path):
+    written(tmp_path / "whole")
+    data = (tmp_path / "whole").read_bytes()
+    for length in range(0, len(data), 37):
+        (tmp_path / "cut").write_bytes(data[:length])
+        with pytest.raises(ValueError, match="path: cut is not a readable safetensors file"):
+            latentds.load(tmp_path / "cut")
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(FileNotFoundError, match="path: no such file"):
+        latentds.load(tmp_path / "nothing")
+
+
+def test_a_save_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "a"
+    ChebyshevDS(2).save(path)
+    before = path.read_bytes()
+    monkeypatch.setattr("safetensors.torch.save", lambda *_, **__: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        ChebyshevDS(3).save(path)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["a"]
+
+
+def test_without_safetensors_the_error_says_what_to_install(tmp_path):
+    code = (
+        "import sys; sys.modules['safetensors'] = None\n"
+        "import latentds\n"
+        "for call in (lambda: latentds.ChebyshevDS(2).save('a'), lambda: latentds.load('a')):\n"
+        "    try: call()\n"
+        "    except ImportError as error: print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.count("need safetensors: pip install 'latentds[files]'") == 2
