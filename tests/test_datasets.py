@@ -87,3 +87,43 @@ def test_bad_number_of_points(n_points):
     ):
         with pytest.raises(ValueError, match="n_points: expected a whole number >= 3, got "):
             make()
+
+
+def test_a_smaller_slowest_speed_ends_later():
+    early, late = datasets.stable_spiral(3, slowest=1e-1), datasets.stable_spiral(3, slowest=1e-3)
+    assert early.duration < datasets.stable_spiral(3).duration < late.duration
+    assert late.velocities[-1].norm().item() == pytest.approx(1e-3, rel=0.05)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_joint_motion_is_smooth_within_the_limits_and_at_rest_at_both_ends(seed):
+    shown = datasets.joint_motion(seed, 500)
+    assert shown.positions.shape == (500, 7)
+    assert (shown.positions.abs().numpy() < datasets.JOINT_LIMITS).all()
+    speeds = shown.velocities.norm(dim=1)
+    assert max(speeds[0], speeds[-1]) < 0.01 * speeds.max()
+    accelerations = shown.velocities.diff(dim=0).norm(dim=1)
+    assert accelerations.diff().abs().max() < 0.2 * accelerations.max()
+    torch.testing.assert_close(shown.positions, datasets.joint_motion(seed, 500).positions)
+    assert not torch.equal(shown.positions, datasets.joint_motion(seed + 1, 500).positions)
+
+
+@pytest.mark.parametrize("name", datasets.STROKES)
+def test_a_drawn_stroke_passes_its_points_and_never_itself(name):
+    shown = datasets.drawn(name)
+    pen = torch.tensor(datasets.STROKES[name], dtype=torch.float64)
+    assert torch.cdist(pen, shown.positions).min(dim=1).values.max() < 0.01
+    assert shown.velocities[[0, -1]].norm(dim=1).max() < 0.01 * shown.velocities.norm(dim=1).max()
+    few = datasets.drawn(name, 200).positions
+    apart = torch.cdist(few, few)
+    far_along = (torch.arange(200)[:, None] - torch.arange(200)).abs() > 60
+    assert apart[far_along].min() > 0.1
+
+
+def test_datasets_refuse_what_does_not_exist():
+    with pytest.raises(ValueError, match=r"name: expected one of hook.*'circle'"):
+        datasets.drawn("circle")
+    with pytest.raises(ValueError, match="seed"):
+        datasets.joint_motion(-1)
+    with pytest.raises(ValueError, match="slowest"):
+        datasets.stable_spiral(1, slowest=0)
