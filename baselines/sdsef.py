@@ -20,7 +20,7 @@ from latentds.training import Plan, Training, descend
 
 PLANS = {
     "official": Plan(epochs=5000, learning_rate=1e-4, weight_decay=1e-10, clip=0.1, patience=250),
-    "tuned": Plan(epochs=300, learning_rate=1e-3, n_batches=4, warm_up=0.05, clip=1.0, slack=0.3),
+    "tuned": Plan(epochs=600, learning_rate=1e-3, n_batches=4, warm_up=0.05, clip=1.0, slack=0.3),
 }
 STAGES = 8
 """Steps from the chord to the demonstration in the tuned recipe."""
@@ -68,6 +68,7 @@ class SDSEF(LatentDS):
         generator = _generator(self_seed)
         psi = AffineCouplings(dim, n_layers, n_features, generator=generator)
         super().__init__(dim, psi, NormalizedDescent(psi, generator=generator))
+        self.n_layers, self.n_features = psi.n_layers, psi.n_features
         self.recipe = recipe
         self.seed = self_seed
 
@@ -88,7 +89,8 @@ class SDSEF(LatentDS):
         with torch.no_grad():
             missed = [self(d.positions.to(self.attractor)) - d.velocities.to(self.attractor) for d in shown]
             mse = float(torch.cat(missed).square().mean())
-        self.fit_report = FitReport(mse, psi.n_layers, time.perf_counter() - began, training.history, training.notes)
+        seconds, origins = time.perf_counter() - began, tuple(d.fingerprint for d in shown)
+        self.fit_report = FitReport(mse, psi.n_layers, seconds, training.history, training.notes, origins)
         return self
 
     @torch.no_grad()
@@ -160,8 +162,8 @@ class NormalizedDescent(LatentDynamics):
         distance = (offset.square().sum(-1) + (floor * self.length) ** 2).sqrt()
         begin = self._stretch(distance)
         end = begin.detach().clamp(max=0.0) - TAIL
-        spread = torch.nan_to_num((begin.detach() - end).amax() if begin.numel() else begin.new_tensor(1.0), posinf=0)
-        n_cells = int(spread.clamp(8, 4096).ceil())
+        spread = (begin.detach() - end).nan_to_num(0.0, 4096).flatten()
+        n_cells = int(torch.cat([spread, spread.new_tensor([8.0])]).amax().clamp(max=4096).ceil())
         step = (begin - end) / n_cells
         nodes = begin.unsqueeze(-1) - step.unsqueeze(-1) * torch.arange(n_cells + 1, dtype=x.dtype, device=x.device)
         radii, growth = self._unstretch(nodes)
@@ -178,6 +180,10 @@ class NormalizedDescent(LatentDynamics):
         later, _ = self._unstretch(begin.unsqueeze(-1) - step.unsqueeze(-1) * along)
         states: Tensor = self.attractor + later.unsqueeze(-1) * direction
         return states
+
+    def slowest_rate(self, radius: float) -> float:
+        slowest = float(torch.exp(self.log_speed_range[0]) / self.duration)
+        return slowest / max(radius, GUARD * float(self.length))
 
     def _stretch(self, r: Tensor) -> Tensor:
         """w(r): log(r/ε) below the guard ε, r/ε - 1 up to FAR lengths, then 100 asinh of a hundredth of the rest."""
@@ -276,22 +282,27 @@ def _train_official(learner: SDSEF, data: _Normalized, generator: torch.Generato
 
 
 def _train_tuned(learner: SDSEF, data: _Normalized, generator: torch.Generator | None, progress: bool) -> Training:
-    """Continuation: chords are on one latent ray to begin with, and a curve that bends slowly is held there."""
+    """Continuation: a chord lies on one latent ray to begin with, and a curve that bends slowly is held there.
+
+    In the plane a curve may cross itself while it bends, so there the demonstration is learned at once.
+    """
     plan = PLANS["tuned"]
+    stages = STAGES if learner.dim > 2 else 1
+    short = plan.epochs // (2 * STAGES)
     history: list[float] = []
     notes: list[str] = []
-    for stage in range(1, STAGES + 1):
-        bending = stage < STAGES
+    for stage in range(1, stages + 1):
+        title = f"stage {stage} of {stages}"
         training = descend(
-            _tuned_loss(learner, data.straightened(stage / STAGES)),
+            _tuned_loss(learner, data.straightened(stage / stages)),
             list(learner.parameters()),
             len(data.points) - len(data.starts),
-            replace(plan, epochs=max(1, plan.epochs // 8), warm_up=0.1) if bending else plan,
+            replace(plan, epochs=max(1, short if stage < stages else plan.epochs - (stages - 1) * short)),
             generator=generator,
-            progress=f"bend {stage} of {STAGES}" if progress and bending else progress,
+            progress=title if progress else False,
         )
         history += training.history
-        notes += training.notes
+        notes += [f"{title}: {note}" for note in training.notes]
     return Training(tuple(history), tuple(notes))
 
 

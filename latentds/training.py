@@ -100,7 +100,8 @@ def descend(
                 if not len(batch):
                     continue
                 adam.zero_grad()
-                value = loss(batch.to(device))
+                with torch.enable_grad():
+                    value = loss(batch.to(device))
                 value.backward()  # type: ignore[no-untyped-call]
                 norm = nn.utils.clip_grad_norm_(parameters, plan.clip)
                 losses.append(float(value.detach()))
