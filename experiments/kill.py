@@ -72,10 +72,12 @@ def _disturb(path: Path, dice: random.Random, most: int, n_seeds: int) -> int:
         jobs = dice.choice((1, 2))
         command = f"from experiments.kill import work; work({str(path)!r}, {jobs}, {n_seeds})"
         child = subprocess.Popen([sys.executable, "-c", command], start_new_session=True)
-        _wait_for_more_than(len(before), path, child)
-        time.sleep(dice.uniform(0, 0.5))
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(child.pid, signal.SIGKILL)  # its workers, too
+        try:
+            _wait_for_more_than(len(before), path, child)
+            time.sleep(dice.uniform(0, 0.5))
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(child.pid, signal.SIGKILL)  # its workers, too
         killed = child.wait() == -signal.SIGKILL
         with CellStore(path) as store:
             after = store.keys()

@@ -224,11 +224,15 @@ def _run(
 def _spread(cells: list[Cell], protocol: Protocol, n_jobs: int | None) -> Generator[Outcome, None, None]:
     """The outcomes as they end, from joblib's workers, wherever they are."""
     joblib = _studies("joblib")
-    if n_jobs is None and joblib.parallel.get_active_backend()[1] is None:
+    backend, configured = joblib.parallel.get_active_backend()
+    if n_jobs is None and configured is None:
         n_jobs = -1
-    parallel = joblib.Parallel(n_jobs=n_jobs, return_as="generator_unordered", batch_size=1)
-    outcomes: Generator[Outcome, None, None] = parallel(joblib.delayed(evaluate)(cell, protocol) for cell in cells)
-    return outcomes
+    streams = backend.supports_return_generator
+    parallel = joblib.Parallel(n_jobs=n_jobs, return_as="generator_unordered" if streams else "list", batch_size=1)
+    # Ray answers a call as a whole: one call per round of workers then, so that a rerun finds the rounds that ended.
+    step = max(1, len(cells) if streams else joblib.effective_n_jobs(-1 if n_jobs is None else n_jobs))
+    for first in range(0, len(cells), step):
+        yield from parallel(joblib.delayed(evaluate)(cell, protocol) for cell in cells[first : first + step])
 
 
 def _name(cell: Cell) -> tuple[str, str, int]:

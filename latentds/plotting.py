@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 # Okabe and Ito's palette, told apart by colour-blind readers.
-COLORS = {"Chebyshev": "#0072B2", "FDM": "#D55E00", "SDS-EF": "#009E73", "TubeDS": "#CC79A7"}
+COLORS = {"Chebyshev": "#0072B2", "FDM": "#D55E00", "SDS-EF": "#009E73", "Tube": "#CC79A7", "TubeDS": "#CC79A7"}
 OTHERS = ("#56B4E9", "#E69F00", "#882255", "#999933")
 SHOWN = "#222222"
 DPI = 150

@@ -9,6 +9,7 @@ import os
 import sqlite3
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
@@ -92,14 +93,20 @@ def fingerprint(*things: Any) -> str:
     digest, sources = hashlib.sha256(), set(_library())
     for part in _parts(things, sources.add, ()):
         digest.update(part)
-    for source in sorted({hashlib.sha256(path.read_bytes()).digest() for path in sources}):
+    for source in sorted(map(_content, sources)):
         digest.update(source)
     return digest.hexdigest()
 
 
-def _library() -> Iterator[Path]:
+@cache
+def _library() -> tuple[Path, ...]:
     drawing = {"plotting.py", "testing.py"}  # change no number
-    return (path for path in Path(__file__).parent.glob("*.py") if path.name not in drawing)
+    return tuple(path for path in Path(__file__).parent.glob("*.py") if path.name not in drawing)
+
+
+@cache
+def _content(path: Path) -> bytes:
+    return hashlib.sha256(path.read_bytes()).digest()
 
 
 def _parts(thing: Any, source: Callable[[Path], None], above: tuple[int, ...]) -> Iterator[bytes]:

@@ -96,7 +96,7 @@ def test_joints_has_a_row_per_coordinate():
 
 def test_a_method_has_one_colour():
     assert plotting.color_of("mine") == plotting.color_of("mine")
-    assert len({plotting.color_of(label) for label in ("Chebyshev", "FDM", "SDS-EF", "TubeDS")}) == 4
+    assert len({plotting.color_of(label) for label in ("Chebyshev", "FDM", "SDS-EF", "Tube")}) == 4
 
 
 def test_bad_input_is_named():
