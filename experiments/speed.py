@@ -254,17 +254,18 @@ def control_loop(calls: int) -> list[Goal]:
     for n_layers, most in ((150, 60), (750, 120)):
         controller = ChebyshevDS(3, n_layers=n_layers).fit(SHOWN).controller()
         points, out = SHOWN.positions.numpy(), np.empty(3)
-        seconds = np.empty(calls)
-        for i in range(calls):
-            y = points[i % len(points)]
-            began = time.perf_counter()
-            controller(y, out)
-            seconds[i] = time.perf_counter() - began
-        micro = seconds * 1e6
+        wall, busy = np.empty(calls), np.empty(calls)
+        for seconds, clock in ((wall, time.perf_counter), (busy, time.thread_time)):
+            for i in range(calls):
+                y = points[i % len(points)]
+                began = clock()
+                controller(y, out)
+                seconds[i] = clock() - began
+        micro = wall * 1e6
         label = f"controller(y), M = {n_layers}"
         goals.append(Goal.of(f"{label}, median", "µs", most, micro, at_most=True))
         late = float(np.quantile(micro, 0.99))
-        note = f"worst of {calls}: {micro.max():.0f} µs"
+        note = f"worst of {calls}: {micro.max():.0f} µs; of CPU time {np.quantile(busy, 0.99) * 1e6:.0f} µs"
         goals.append(Goal(f"{label}, 99th percentile", "µs", "≤ 1000", late, late, late, late <= 1000, note))
     return goals
 
