@@ -1,0 +1,363 @@
+"""TubeDS and its parts: demonstrated time law, tube dynamics, arc-length path; motions that are hard to learn from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import astuple
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+from latentds import Demonstration, datasets
+from latentds.embedding import arc_length_path
+from latentds.metrics import dtw
+from latentds.testing import wavy_motion
+from latentds.time_law import PiecewiseLinearLaw, TubeDynamics
+from latentds.tube import TubeDS, mean_motion
+
+
+def tensor(values):
+    return torch.as_tensor(values, dtype=torch.float64)
+
+
+def motion(clock, *, dt=0.01, count=400):
+    """A bent plane curve travelled by a clock: share of the time -> share of the way."""
+    way = clock(np.linspace(0, 1, count))
+    return Demonstration(tensor(np.stack([1 - way, 0.3 * np.sin(4 * way)], 1)), dt)
+
+
+def rest_first(t):
+    return np.clip((t - 0.3) / 0.7, 0, 1)
+
+
+def pause(t):
+    return np.interp(t, [0, 0.35, 0.6, 1], [0, 0.5, 0.5, 1])
+
+
+def rest_at_both_ends(t):
+    return np.interp(t, [0, 0.25, 0.75, 1], [0, 0, 1, 1])
+
+
+def creep_then_dash(t):
+    return t**5
+
+
+def fast(dim, **settings):
+    return TubeDS(dim, **{"n_layers": 60, "refined": False} | settings)
+
+
+def rolled(ds, shown, start=None):
+    with torch.no_grad():
+        return ds.rollout(shown.start if start is None else start, shown.times)
+
+
+# --- the demonstrated time law ----------------------------------------------------------------------------------------
+
+TIMINGS = {
+    "even": (np.linspace(1, 0, 200), np.linspace(0, 2, 200)),
+    "slow start": (1 - np.linspace(0, 1, 200) ** 3, np.linspace(0, 2, 200)),
+    "pause": (np.array([1, 0.8, 0.6, 0.59, 0.3, 0.0]), np.array([0, 0.2, 0.4, 1.9, 2.2, 2.5])),
+    "rest at the start": (np.array([1, 0.999, 0.5, 0.0]), np.array([0, 3.0, 3.5, 4.0])),
+    "two points": (np.array([1.0, 0.0]), np.array([0.0, 0.7])),
+    "milliseconds": (np.linspace(1, 0, 200), np.linspace(0, 2e-3, 200)),
+}
+
+
+@pytest.mark.parametrize(("progress", "times"), TIMINGS.values(), ids=TIMINGS.keys())
+def test_a_law_takes_the_demonstrated_time(progress, times):
+    law = PiecewiseLinearLaw.from_timing(tensor(progress), tensor(times))
+    left = law.time_to_go(torch.ones(1, dtype=torch.float64))
+    s = law.progress_at(left - tensor(times))
+    # a tail of 1e-3 is all that is missing at the end
+    assert np.abs(s.numpy() - progress).max() < 0.02
+    spent = (left - law.time_to_go(tensor(np.maximum(progress, 2e-3)))).numpy()
+    assert np.abs(spent - times)[:-1].max() < 0.01 * times[-1]
+
+
+def test_above_the_start_the_speed_becomes_the_mean():
+    """What starts behind a rest is not held up by it."""
+    progress, times = TIMINGS["rest at the start"]
+    law = PiecewiseLinearLaw.from_timing(tensor(progress), tensor(times))
+    speed = law.speed(tensor([1.0, 1.02, 1.5, 10.0]))
+    assert speed[0] < 0.1 * 0.25
+    torch.testing.assert_close(speed[1:], torch.full((3,), 0.25, dtype=torch.float64))
+
+
+# --- tube dynamics ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [1, 2, 7])
+def test_flow_agrees_with_solve_ivp(dim, draw):
+    along = PiecewiseLinearLaw(tensor([0.01, 0.4, 1.0]), tensor([0.3, 2.0, 0.7]))
+    dynamics = TubeDynamics(dim, along, PiecewiseLinearLaw(tensor([0.2]), tensor([1.5])))
+    start, goal = torch.randn(2, dim, generator=draw, dtype=torch.float64)
+    dynamics.aim(start, goal)
+    x = torch.cat([start[None], goal + 3 * torch.randn(5, dim, generator=draw, dtype=torch.float64)])
+    times = torch.linspace(0, 1.5, 6, dtype=torch.float64)
+    path = dynamics.flow(x, times)
+    solved = solve_ivp(
+        lambda _, flat: dynamics(tensor(flat).view(x.shape), x).reshape(-1).numpy(),
+        (0, 1.5), x.numpy().ravel(), "LSODA", times.numpy(), rtol=1e-10, atol=1e-12,
+    )  # fmt: skip
+    assert np.abs(solved.y.T.reshape(6, *x.shape).swapaxes(0, 1) - path.numpy()).max() < 1e-7
+    assert (dynamics.lyapunov(path).diff(dim=-1) < 0).all()
+    assert (dynamics(goal, goal) == 0).all()
+    torch.testing.assert_close(dynamics.flow(goal, times), goal.expand(6, dim), rtol=0, atol=0)
+
+
+def test_offset_shrinks_at_the_rate_and_no_faster_than_the_cap():
+    dynamics = TubeDynamics(2, PiecewiseLinearLaw.uniform(), PiecewiseLinearLaw(tensor([0.25]), tensor([0.25 * 8])))
+    dynamics.aim(tensor([2.0, 0.0]), tensor([0.0, 0.0]))
+    near = dynamics.flow(tensor([1.0, 0.4]), tensor([0.0, 0.1]))[:, 1]
+    torch.testing.assert_close(near[1] / near[0], tensor(math.exp(-0.8)))
+    offsets = tensor([[1.0, 0.5], [1.0, 5.0], [1.0, 500.0]])
+    torch.testing.assert_close(dynamics(offsets, offsets)[:, 1], tensor([-4.0, -4.0, -4.0]))
+
+
+# --- the path evenly spaced in arc length -----------------------------------------------------------------------------
+
+
+def test_points_are_even_and_times_fit():
+    t = np.linspace(0, 1, 500)
+    positions = np.stack([np.cos(2 * t**3), np.sin(2 * t**3)], 1)  # uneven: almost all points lie at the start
+    path, way, times = arc_length_path(positions, 3 * t, 100)
+    gaps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    assert np.ptp(gaps) < 0.01 * gaps.mean()
+    assert np.array_equal(path[[0, -1]], positions[[0, -1]])
+    assert (np.diff(way) < 0).all()
+    assert (np.diff(times) > 0).all()
+    assert way[[0, -1]].tolist() == [1, 0]
+    np.testing.assert_allclose(way, 1 - (times / 3) ** 3, atol=3e-3)
+
+
+def test_jitter_at_rest_adds_no_path():
+    way = pause(np.linspace(0, 1, 3000))
+    clean = np.stack([way, way**2], 1)
+    noisy = clean + 5e-4 * np.random.default_rng(0).standard_normal(clean.shape)
+    raw, length = (np.linalg.norm(np.diff(p, axis=0), axis=1).sum() for p in (noisy, clean))
+    path = arc_length_path(noisy, np.arange(3000.0), 400)[0]
+    assert raw > 2 * length
+    assert np.linalg.norm(np.diff(path, axis=0), axis=1).sum() == pytest.approx(length, rel=0.03)
+
+
+def test_rest_at_the_goal_is_cut_and_at_the_start_kept():
+    way = rest_at_both_ends(np.linspace(0, 1, 401))
+    _, _, times = arc_length_path(np.stack([way, way**2], 1), np.linspace(0, 4, 401), 100)
+    assert times[-1] == pytest.approx(3.0, abs=0.03)
+    assert times[1] == pytest.approx(1.0, abs=0.03)
+
+
+# --- hard demonstrations ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("clock", [rest_first, pause, rest_at_both_ends, creep_then_dash])
+def test_position_at_time_t_is_the_demonstrations(clock):
+    shown = motion(clock)
+    ds = fast(2).fit(shown)
+    path = rolled(ds, shown)
+    missed = (path - shown.positions).norm(dim=-1) / shown.size
+    assert missed.max() < 0.03
+    assert missed.mean() < 0.006
+    assert dtw(path, shown.positions) / len(shown) < 0.003 * shown.size
+
+
+def test_seven_joints():
+    shown = wavy_motion(7, n_points=400)
+    ds = fast(7, refined=True).fit(shown)
+    assert dtw(rolled(ds, shown), shown.positions) / len(shown) < 0.003 * shown.size
+    assert ds.fit_report.condition_path <= ds.fit_report.condition_tube < 30
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 7])
+@pytest.mark.parametrize("n_layers", [5, 60])
+def test_the_attractor_is_exact(dim, n_layers):
+    shown = wavy_motion(dim)
+    ds = fast(dim, n_layers=n_layers).fit(shown)
+    assert torch.equal(ds.attractor, shown.goal)
+    with torch.no_grad():
+        assert ds(shown.goal).norm() < 1e-9 * shown.size
+        late = ds.rollout(shown.start + 0.1, tensor([0.0, 40 * shown.duration]))[-1]
+    assert (late - shown.goal).norm() < 1e-9 * shown.size
+
+
+@pytest.mark.parametrize("n_layers", [1, 5])
+def test_few_layers_are_still_a_stable_system(n_layers):
+    """Too few to follow the motion, so the start is where it must begin and the goal where it must end."""
+    shown = motion(lambda t: t)
+    ds = fast(2, n_layers=n_layers).fit(shown)
+    path = rolled(ds, shown)
+    assert torch.equal(path[0], shown.start)
+    assert (path[-1] - shown.goal).norm() < 0.05 * shown.size
+    assert ds.fit_report.n_layers == n_layers
+
+
+def closed_loop():
+    t = np.linspace(0, 2 * np.pi, 300)
+    return np.stack([np.cos(t), np.sin(t)], 1)
+
+
+def figure_of_alpha():
+    t = np.linspace(-1.4, 1.4, 300)
+    return np.stack([t**2, t**3 - t], 1)
+
+
+@pytest.mark.parametrize("positions", [closed_loop(), figure_of_alpha()], ids=["closed loop", "crossing"])
+def test_a_path_that_meets_itself_is_refused(positions):
+    with pytest.raises(ValueError, match=r"demonstration: expected a path that does not meet itself.*one velocity"):
+        fast(2).fit(Demonstration(positions, 0.01))
+
+
+def test_a_path_that_passes_itself_at_a_distance_is_learned():
+    """The same crossing, its strands .4 apart in the third dimension."""
+    flat = figure_of_alpha()
+    shown = Demonstration(np.column_stack([flat, np.linspace(0, 0.6, len(flat))]), 0.01)
+    ds = fast(3, n_layers=100).fit(shown)
+    assert dtw(rolled(ds, shown), shown.positions) / len(shown) < 0.003 * shown.size
+
+
+def test_noise_is_no_crossing():
+    shown = motion(pause)
+    noise = 3e-4 * tensor(np.random.default_rng(0).standard_normal((400, 2)))
+    noisy = Demonstration(shown.positions + noise, shown.dt)
+    ds = fast(2).fit(noisy)
+    assert dtw(rolled(ds, shown), shown.positions) / len(shown) < 0.005 * shown.size
+
+
+# --- far away ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dim", [2, 3, 7])
+def test_far_starts_and_starts_behind_the_goal_arrive_without_wild_speeds(dim, draw):
+    shown = wavy_motion(dim)
+    ds = fast(dim).fit(shown)
+    scale = shown.size * torch.tensor([0.3, 1.0, 3.0, 10.0], dtype=torch.float64).repeat_interleave(8)
+    around = torch.nn.functional.normalize(torch.randn(32, dim, generator=draw, dtype=torch.float64), dim=-1)
+    behind = shown.goal + (shown.goal - shown.start) * tensor([[0.5], [2.0], [10.0]])
+    starts = torch.cat([shown.goal + scale[:, None] * around, behind])
+    times = torch.linspace(0, 40 * shown.duration, 4001, dtype=torch.float64)
+    with torch.no_grad():
+        path = ds.rollout(starts, times)
+        speeds = ds(path).norm(dim=-1).amax(dim=-1)
+    assert ((path[:, -1] - shown.goal).norm(dim=-1) < 1e-3 * shown.size).all()
+    pull = 0.25 * ds.contraction * shown.size / shown.duration  # as fast as it may come in from the side
+    most = shown.velocities.norm(dim=-1).max() + pull
+    assert speeds.max() < 3 * ds.fit_report.condition_tube * most
+
+
+def test_contraction_draws_a_start_back_sooner():
+    shown = datasets.unstable_spiral(3, 300)
+    scores = []
+    for kappa in (0.5, 20.0):
+        ds = fast(3, contraction=kappa).fit(shown)
+        scores.append(dtw(rolled(ds, shown, shown.start + tensor([0.05, 0.05, 0.0])), shown.positions))
+    assert scores[1] < 0.4 * scores[0]
+
+
+@pytest.mark.parametrize("contraction", [0, -1, math.inf, math.nan, "much"])
+def test_bad_contraction(contraction):
+    with pytest.raises(ValueError, match="contraction: expected a number in "):
+        TubeDS(2, contraction=contraction)
+
+
+# --- several demonstrations -------------------------------------------------------------------------------------------
+
+
+def family(count=5, *, end_apart=0.0):
+    """One bend, wider and narrower, from starts in a row; each of another length."""
+    found = []
+    for i, wide in enumerate(np.linspace(-1, 1, count)):
+        way = np.linspace(0, 1, 300 + 20 * i)
+        bend = np.stack([1 - way, (0.3 + 0.1 * wide) * np.sin(np.pi * way) + 0.15 * wide * (1 - way)], 1)
+        found.append(Demonstration(bend + end_apart * np.array([wide, 0]), 0.01, f"{i}"))
+    return found
+
+
+def test_several_are_followed_better_than_one():
+    shown = family()
+    together, alone = fast(2).fit(shown), fast(2).fit(shown[0])
+    scores = np.array([[dtw(rolled(ds, d), d.positions) / len(d) for d in shown[1:]] for ds in (together, alone)])
+    assert scores[0].mean() < 0.7 * scores[1].mean()
+
+
+def test_several_agree_on_a_goal_and_report_their_spread():
+    shown = family(end_apart=0.02)
+    ds = fast(2).fit(shown)
+    goals = torch.stack([d.goal for d in shown])
+    torch.testing.assert_close(ds.attractor, goals.mean(0))
+    assert len(ds.fit_report.spread) == 2
+    assert ds.fit_report.spread[1] > 0.03
+    assert ds.fit_report.spread[1] > 2 * ds.fit_report.spread[0]
+
+
+def test_mean_of_equal_ones_is_each_of_them():
+    shown = family()[0]
+    mean, spread = mean_motion([shown] * 3)
+    torch.testing.assert_close(mean.positions, shown.positions)
+    assert mean.dt == pytest.approx(shown.dt)
+    assert max(spread) < 1e-12
+    assert mean_motion([shown]) == (shown, (0.0, 0.0))
+
+
+# --- units, types, report ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+@pytest.mark.parametrize("refined", [False, True])
+def test_units_and_origin_do_not_matter(scale, refined):
+    """Metres or millimetres, wherever the origin lies."""
+    shown, shift = motion(pause), tensor([7.0, -2.0])
+    here = fast(2, refined=refined).fit(shown)
+    there = fast(2, refined=refined).fit(Demonstration(scale * (shown.positions + shift), shown.dt))
+    start = shown.start + tensor([0.03, 0.05])
+    moved = rolled(there, shown, scale * (start + shift)) / scale - shift
+    tolerance = 1e-3 if refined else 1e-6  # L-BFGS runs on to another rounding
+    assert (moved - rolled(here, shown, start)).norm(dim=-1).max() < tolerance * shown.size
+    for mine, theirs in zip(astuple(here.fit_report), astuple(there.fit_report), strict=True):
+        if isinstance(mine, str):
+            assert mine == theirs
+
+
+def test_a_slower_clock_slows_everything():
+    shown = motion(pause)
+    slow = Demonstration(shown.positions, 10 * shown.dt)
+    here, there = fast(2).fit(shown), fast(2).fit(slow)
+    y = shown.positions[::40] + 0.02
+    with torch.no_grad():
+        torch.testing.assert_close(there(y) * 10, here(y), rtol=1e-6, atol=1e-9)
+
+
+def test_a_float32_module():
+    shown = motion(pause)
+    ds = fast(2).float().fit(shown)
+    assert {t.dtype for t in ds.state_dict().values()} == {torch.float32}
+    path = rolled(ds, shown)
+    assert path.dtype == torch.float64  # the input's
+    assert dtw(path, shown.positions) / len(shown) < 0.003 * shown.size
+    torch.testing.assert_close(path, rolled(fast(2).fit(shown), shown), rtol=0, atol=1e-3)
+
+
+def test_report_agrees_with_autograd():
+    shown = motion(lambda t: t)
+    ds = fast(2).fit(shown)
+    report = ds.fit_report
+    rows = torch.func.vmap(torch.func.jacrev(ds.diffeomorphism))(ds.encode(shown.positions[::5]))
+    assert report.condition_path == pytest.approx(torch.linalg.cond(rows.detach()).max().item(), rel=0.05)
+    with torch.no_grad():
+        on_path = ds(shown.positions)
+        step = 1e-6 * torch.eye(2, dtype=torch.float64)
+        y = shown.positions[:, None]
+        slopes = torch.linalg.matrix_norm((ds(y + step) - ds(y - step)) / 2e-6, 2).max() * shown.duration
+    length = float(shown.positions.diff(dim=0).norm(dim=-1).sum())
+    assert report.largest_velocity >= on_path.norm(dim=-1).max() * shown.duration / length * 0.99
+    assert report.largest_gradient >= 0.9 * slopes
+    assert report.isotopy in ("straight", "unbending")
+    assert 0 <= report.rollout_error < 0.01
+
+
+def test_refinement_pays():
+    shown = datasets.unstable_spiral(7, 300)
+    plain, better = (TubeDS(3, n_layers=60, refined=refined).fit(shown) for refined in (False, True))
+    scores = [dtw(rolled(ds, shown), shown.positions) for ds in (plain, better)]
+    assert scores[1] < 0.7 * scores[0]
