@@ -32,22 +32,27 @@ class Couplings:
         self.frequencies = torch.cat([part.mT.flatten() for part in frequencies]).numpy()
         self.phases = torch.stack(list(phases)).numpy()
 
-    def sweep(self, u: Tensor, amplitudes: Sequence[Tensor]) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
-        """φ(u), and per layer the shrinking (N, b) and the slope (N, b, a) of its inverse. Differentiable once.
+    def linearize(self, u: Tensor, amplitudes: Sequence[Tensor]) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+        """φ(u), and the map of tangents (..., N, n) by the inverse of its Jacobian. Differentiable once.
 
         Args:
             u: (N, n).
             amplitudes: per layer (2, b, F).
         """
-        x, shrink, slope = _Sweep.apply(u, torch.cat([part.flatten() for part in amplitudes]), self)  # type: ignore[no-untyped-call]
-        sizes = [(part.shape[1], u.shape[1] - part.shape[1]) for part in amplitudes]
-        return x, [
-            (one[:, :moved], other[:, :moved, :read])
-            for one, other, (moved, read) in zip(shrink.unbind(1), slope.unbind(1), sizes, strict=True)
-        ]
+        joined = torch.cat([part.flatten() for part in amplitudes])
+        x, shrink, slope = _Sweep.apply(u, joined, self)  # type: ignore[no-untyped-call]
+
+        def push(tangent: Tensor) -> Tensor:
+            stack = tangent.reshape(-1, *u.shape)
+            pushed: Tensor = _Push.apply(stack, shrink, slope)  # type: ignore[no-untyped-call]
+            return pushed.reshape(tangent.shape)
+
+        return x, push
 
 
 class _Sweep(torch.autograd.Function):
+    """φ(u), and of every layer's inverse the shrinking (N, L, h) and the slope (N, L, h, h), h = ⌈n/2⌉."""
+
     @staticmethod
     def forward(ctx: Any, u: Tensor, amplitudes: Tensor, couplings: Couplings) -> tuple[Tensor, Tensor, Tensor]:
         (n_points, dim), (n_layers, _, _) = u.shape, couplings.phases.shape
@@ -72,6 +77,26 @@ class _Sweep(torch.autograd.Function):
         others = to_shrink.contiguous().numpy(), to_slope.contiguous().numpy()
         _backward(gradient, *others, *ctx.given, *ctx.seen, to_amplitudes)
         return torch.from_numpy(gradient), torch.from_numpy(to_amplitudes), None
+
+
+class _Push(torch.autograd.Function):
+    """Tangents (S, N, n) through the layers' inverses, last layer first."""
+
+    @staticmethod
+    def forward(ctx: Any, tangents: Tensor, shrink: Tensor, slope: Tensor) -> Tensor:
+        count, n_points, dim = tangents.shape
+        ctx.seen = np.empty((count, n_points, shrink.shape[1] + 1, dim), F32), shrink.numpy(), slope.numpy()
+        ctx.seen[0][:, :, -1] = tangents.numpy()
+        _push_forward(*ctx.seen)
+        return torch.from_numpy(ctx.seen[0][:, :, 0].copy())
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, to_pushed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        shapes = [part.shape for part in ctx.seen[1:]]
+        results = to_pushed.contiguous().clone(), torch.zeros(shapes[0]), torch.zeros(shapes[1])
+        _push_backward(*ctx.seen, *(part.numpy() for part in results))
+        return results
 
 
 def _compiled(function: Callable[..., Any]) -> Any:
@@ -105,7 +130,8 @@ def _forward(W: Array, b: Array, A: Array, states: Array, grown: Array, affine: 
                     for k in range(read):
                         w = w0 + (h * read + k) * n_features
                         slopes[j, layer, h, i, k] = -_dot3(A[o : o + n_features], W[w : w + n_features], sines)
-            later[part::2] = state[part::2]
+            for k in range(read):
+                later[2 * k + part] = state[2 * k + part]
             for i in range(moved):
                 q = 2 * i + 1 - part
                 grown[j, layer, i] = state[q] * math.exp(affine[j, layer, 0, i])
@@ -155,17 +181,15 @@ def _backward(
                 to_moved[i] = to_grown * growth
             for h in range(2):
                 _waves(W, b[layer, h], states[j, layer, part::2], w0 + h * read * n_features, cosines, sines)
-                to_angles[:] = F32(0)
+                _clear(to_angles)
                 for i in range(moved):
-                    mixed[:] = F32(0)
+                    _clear(mixed)
                     for k in range(read):
                         w = w0 + (h * read + k) * n_features
                         _add(mixed, to_slopes[h, i, k], W[w : w + n_features])
                     o = a0 + (h * moved + i) * n_features
                     row, to_row, whole = A[o : o + n_features], to_A[o : o + n_features], to_affine[h, i]
-                    for f in range(n_features):
-                        to_row[f] += whole * cosines[f] - mixed[f] * sines[f]
-                        to_angles[f] -= row[f] * (whole * sines[f] + mixed[f] * cosines[f])
+                    _scatter(to_row, to_angles, row, whole, mixed, cosines, sines)
                 for k in range(read):
                     w = w0 + (h * read + k) * n_features
                     gradient[j, 2 * k + part] += _dot(to_angles, W[w : w + n_features])
@@ -174,14 +198,62 @@ def _backward(
 
 
 @_compiled
+def _push_forward(tangents: Array, shrink: Array, slope: Array) -> None:
+    """``tangents`` (S, N, L + 1, n) from what entered, at L, to what leaves, at 0."""
+    count, n_points, depth, dim = tangents.shape
+    for s in range(count):
+        for j in range(n_points):
+            for layer in range(depth - 2, -1, -1):
+                part = layer % 2
+                read = (dim + 1 - part) // 2
+                before, after = tangents[s, j, layer + 1], tangents[s, j, layer]
+                for k in range(read):
+                    after[2 * k + part] = before[2 * k + part]
+                for i in range(dim - read):
+                    rest = before[2 * i + 1 - part]
+                    for k in range(read):
+                        rest -= slope[j, layer, i, k] * before[2 * k + part]
+                    after[2 * i + 1 - part] = rest * shrink[j, layer, i]
+
+
+@_compiled
+def _push_backward(
+    tangents: Array, shrink: Array, slope: Array, gradient: Array, to_shrink: Array, to_slope: Array
+) -> None:
+    """``gradient`` enters as the cotangent of what left and leaves as that of what entered."""
+    count, n_points, depth, dim = tangents.shape
+    for s in range(count):
+        for j in range(n_points):
+            flow = gradient[s, j]
+            for layer in range(depth - 1):
+                part = layer % 2
+                read = (dim + 1 - part) // 2
+                before, after = tangents[s, j, layer + 1], tangents[s, j, layer]
+                for i in range(dim - read):
+                    q = 2 * i + 1 - part
+                    to_shrink[j, layer, i] += flow[q] * after[q] / shrink[j, layer, i]
+                    flow[q] *= shrink[j, layer, i]
+                    for k in range(read):
+                        to_slope[j, layer, i, k] -= flow[q] * before[2 * k + part]
+                        flow[2 * k + part] -= flow[q] * slope[j, layer, i, k]
+
+
+@_compiled
 def _waves(W: Array, phases: Array, p: Array, at: int, cosines: Array, sines: Array) -> None:
-    """cos and sin of W p + b, to 1e-6 while the angles stay below 1e4: x = k π + r, and Taylor series in r."""
+    """cos and sin of W p + b, to 1e-6 while the angles stay below 1e4."""
     n_features = len(phases)
-    cosines[:] = phases
+    for f in range(n_features):
+        cosines[f] = phases[f]
     for i in range(len(p)):
         _add(cosines, p[i], W[at + i * n_features : at + (i + 1) * n_features])
-    for f in range(n_features):
-        x = cosines[f]
+    _turn(cosines, sines)
+
+
+@_compiled
+def _turn(angles: Array, sines: Array) -> None:
+    """``angles`` x into cos x, and sin x: x = k π + r, and Taylor series in r."""
+    for f in range(len(angles)):
+        x = angles[f]
         turns = np.floor(x * F32(1 / math.pi) + F32(0.5))
         r = (x - turns * F32(3.140625)) - turns * F32(math.pi - 3.140625)
         sign = F32(1) - F32(2) * (turns - F32(2) * np.floor(turns * F32(0.5)))
@@ -191,7 +263,22 @@ def _waves(W: Array, phases: Array, p: Array, at: int, cosines: Array, sines: Ar
         cosine = F32(1 / 40320) + z * (F32(-1 / 3628800) + z * F32(1 / 479001600))
         cosine = F32(1) + z * (F32(-0.5) + z * (F32(1 / 24) + z * (F32(-1 / 720) + z * cosine)))
         sines[f] = sign * r * sine
-        cosines[f] = sign * cosine
+        angles[f] = sign * cosine
+
+
+@_compiled
+def _scatter(
+    to_row: Array, to_angles: Array, row: Array, whole: float, mixed: Array, cosines: Array, sines: Array
+) -> None:
+    for f in range(len(row)):
+        to_row[f] += whole * cosines[f] - mixed[f] * sines[f]
+        to_angles[f] -= row[f] * (whole * sines[f] + mixed[f] * cosines[f])
+
+
+@_compiled
+def _clear(row: Array) -> None:
+    for f in range(len(row)):
+        row[f] = F32(0)
 
 
 @_compiled

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -304,9 +303,17 @@ class AffineCouplings(Diffeomorphism):
         for source, layer in self._couplings():
             log_scale, shift, log_scale_slope, shift_slope = layer.with_slopes(parts[source])
             grown = parts[1 - source] * torch.exp(log_scale)
-            steps.append((torch.exp(-log_scale), grown.unsqueeze(-1) * log_scale_slope + shift_slope))
+            steps.append((source, torch.exp(-log_scale), grown.unsqueeze(-1) * log_scale_slope + shift_slope))
             parts[1 - source] = grown + shift
-        return self._join(parts), partial(self._push, steps)
+
+        def push(tangent: Tensor) -> Tensor:
+            parts = [tangent[..., 0::2], tangent[..., 1::2]]
+            for source, shrink, slope in reversed(steps):
+                sheared = (slope * parts[source].unsqueeze(-2)).sum(-1)
+                parts[1 - source] = (parts[1 - source] - sheared) * shrink
+            return self._join(parts) * self.scale
+
+        return self._join(parts), push
 
     def compiled_linearize(self) -> Callable[[Tensor], tuple[Tensor, Callable[[Tensor], Tensor]]]:
         """:meth:`linearize` for training on the CPU in float32: several times faster, differentiable once.
@@ -317,18 +324,10 @@ class AffineCouplings(Diffeomorphism):
         compiled = Couplings([layer.frequencies for layer in layers], [layer.phases for layer in layers])
 
         def linearize(y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-            x, steps = compiled.sweep(self.normalize(y), [layer.amplitudes for layer in layers])
-            return x, partial(self._push, steps)
+            x, push = compiled.linearize(self.normalize(y), [layer.amplitudes for layer in layers])
+            return x, lambda tangent: push(tangent) * self.scale
 
         return linearize
-
-    def _push(self, steps: list[tuple[Tensor, Tensor]], tangent: Tensor) -> Tensor:
-        """J_ψ t, layer by layer, from the (shrinking, slope) of each that the sweep to x left."""
-        parts = [tangent[..., 0::2], tangent[..., 1::2]]
-        for j in reversed(range(len(steps))):
-            (shrink, slope), source = steps[j], j % 2
-            parts[1 - source] = (parts[1 - source] - (slope * parts[source].unsqueeze(-2)).sum(-1)) * shrink
-        return self._join(parts) * self.scale
 
     def jacobian(self, x: Tensor) -> Tensor:
         _, push = self.linearize(self(x))
