@@ -39,7 +39,7 @@ def dtw(path: Any, reference: Any) -> float:
 def fast_dtw(path: Any, reference: Any, radius: int = 1) -> float:
     """FastDTW (Salvador and Chan 2007), the paper's score: an upper bound of :func:`dtw`.
 
-    On a spiral it can be 25 times too large at radius 1; see :func:`dtw` for the value itself.
+    At radius 1 it can be far too large on a path that winds; see :func:`dtw` for the value itself.
 
     Args:
         path: (N, n).
