@@ -7,6 +7,7 @@ Leaves rows.csv, summary.md, settings.json and pictures in ``--out``.
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -24,7 +25,7 @@ from scipy import stats
 
 from baselines import FDM, SDSEF
 from experiments import report
-from latentds import ChebyshevDS, Demonstration, datasets, plotting
+from latentds import ChebyshevDS, Demonstration, TubeDS, datasets, plotting
 from latentds.benchmark import COLUMNS, Cell, Factory, Outcome, Protocol, run
 
 
@@ -66,6 +67,7 @@ def methods(spiral: str, quick: bool) -> dict[str, Factory]:
         "Chebyshev": lambda dim: ChebyshevDS(dim, n_layers=ours.n_layers, beta=ours.beta, mu=ours.mu),
         "FDM": lambda dim: FDM(dim, n_layers=straight.n_layers, beta=straight.beta, mu=straight.mu),
         "SDS-EF": lambda dim: SDSEF(dim, **sdsef_size(quick)),
+        "TubeDS": lambda dim: TubeDS(dim),
     }
 
 
@@ -92,7 +94,7 @@ def main(
 
     Finished cells are kept in cells.sqlite beside the results: an interrupted run goes on where it stopped.
     """
-    began, console = time.perf_counter(), Console()
+    began, console = time.perf_counter(), Console(width=None if sys.stdout.isatty() else 120)
     shown, seeds = spirals(quick), seeds or [0]
     cells = [Cell(label, f, d, seed) for d in shown for label, f in methods(d.name, quick).items() for seed in seeds]
     done: list[Outcome] = []

@@ -271,6 +271,8 @@ def evaluate(cell: Cell, protocol: Protocol) -> Outcome:
                 moved = ds.rollout(starts, times)
                 facts["rollout_seconds"] = time.perf_counter() - began
                 converged = _converged(ds, shown, starts)
+            if moved.shape != paths.shape:
+                raise ValueError(f"rollout: expected shape {paths.shape}, got {tuple(moved.shape)}")
             paths[:] = moved.numpy()
     except Exception as raised:
         error = f"{type(raised).__name__}: {raised}"

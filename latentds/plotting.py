@@ -156,7 +156,7 @@ def dtw_bars(rows: pd.DataFrame, title: str = "") -> Figure:
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("")
     axes.set_xticks(np.arange(len(motions)), motions)
-    axes.set(ylabel="exact DTW, sum over the path", title=title)
+    axes.set(xlim=(-0.5, len(motions) - 0.5), ylabel="exact DTW, sum over the path", title=title)
     axes.grid(axis="y", color="#DDDDDD", lw=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)

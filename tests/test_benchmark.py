@@ -44,6 +44,13 @@ class Explosive(Straight):
         return path
 
 
+class Lone(Straight):
+    """Forgets that starts come in batches."""
+
+    def rollout(self, y0, t):
+        return super().rollout(y0, t)[0]
+
+
 class Lost(Straight):
     """Converges, but not to the goal."""
 
@@ -136,7 +143,7 @@ def test_nothing_global_changes():
 
 
 @pytest.mark.parametrize(
-    "bad", [refuse, lambda dim: 3, lambda dim: ChebyshevDS(dim + 1), lambda dim: FDM(dim, beta=-1)]
+    "bad", [refuse, Lone, lambda dim: 3, lambda dim: ChebyshevDS(dim + 1), lambda dim: FDM(dim, beta=-1)]
 )
 def test_a_method_that_raises_becomes_rows_that_say_so(bad):
     rows = compare({"bad": bad, "good": Straight}, SPIRAL, **QUICK)
