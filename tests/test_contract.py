@@ -9,13 +9,14 @@ import torch
 
 import baselines.sdsef
 from baselines import FDM, SDSEF
-from latentds import ChebyshevDS, Demonstration
+from latentds import ChebyshevDS, Demonstration, TubeDS
 from latentds.testing import check_stable_ds, wavy_motion
 
 METHODS = {
     "ChebyshevDS": lambda dim: ChebyshevDS(dim, n_layers=30),
     "FDM": lambda dim: FDM(dim, n_layers=30),
     "SDSEF": lambda dim: SDSEF(dim, n_layers=4, n_features=20, seed=0),
+    "TubeDS": lambda dim: TubeDS(dim, n_layers=30, refined=False),
 }
 
 
