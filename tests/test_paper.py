@@ -1,0 +1,149 @@
+"""The reproduction: the paper's rule word for word, tuning and cells that are kept, claims against oracles."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+import typer
+from typer.testing import CliRunner
+
+from baselines import FDM, sdsef
+from experiments import claims, paper, tuning
+from experiments.spirals import Setting
+from experiments.tuning import Choice, Grid, Tried, choose
+from latentds import ChebyshevDS, benchmark, datasets
+from latentds.benchmark import Protocol
+from latentds.embedding import chebyshev_eigenvalues
+
+SMALL = Grid(betas=(0.3, 0.9), mus=(0.6, 0.9), n_layers=(5, 10, 75), n_more=1)
+
+
+def test_the_rule_takes_the_fewest_layers_then_the_least_beta_or_the_least_mse():
+    few_smooth = Tried(0.3, 0.8, 50, 8e-6, 8e-6)
+    few_exact = Tried(0.9, 0.6, 50, 2e-6, 2e-6)
+    deep = Tried(0.1, 0.9, 75, 1e-9, 1e-9)
+    bad = Tried(0.1, 0.1, 25, 1e-5, 1e-5)
+    assert choose([deep, bad, few_exact, few_smooth]) == Choice(few_smooth, few_exact, True)
+    assert choose([bad, bad._replace(mse=2e-5, normalised=2e-5)]) == Choice(bad, bad, False)
+
+
+@pytest.mark.parametrize(("method", "kind"), [("Chebyshev", ChebyshevDS), ("FDM", FDM)])
+def test_a_match_begins_with_every_shorter_one(method, kind):
+    shown = datasets.unstable_spiral(3, 200)
+    for count, error in zip((7, 20), tuning.trace(method, shown, 0.5, 0.8, (7, 20)), strict=True):
+        fitted = kind(3, n_layers=count, beta=0.5, mu=0.8).fit(shown)
+        assert error == pytest.approx(fitted.fit_report.mse, rel=1e-6)
+
+
+def test_tuning_tries_the_whole_grid_once_and_is_kept(tmp_path, monkeypatch):
+    shown = replace(datasets.unstable_spiral(1, 100), positions=3 * datasets.unstable_spiral(1, 100).positions)
+    grid, more = tuning.Tuner(tmp_path / "optuna.sqlite", 1).greedy("FDM", shown, SMALL)
+    assert sorted((one.beta, one.mu, one.n_layers) for one in grid) == sorted(
+        (beta, mu, count) for beta in SMALL.betas for mu in SMALL.mus for count in SMALL.n_layers
+    )
+    assert len(more) == len(SMALL.n_layers)
+    assert grid[0].normalised == pytest.approx(grid[0].mse / 9, rel=1e-2)  # the largest extent is a little below 2
+    monkeypatch.setattr(tuning, "trace", None)
+    assert tuning.Tuner(tmp_path / "optuna.sqlite", 1).greedy("FDM", shown, SMALL) == (grid, more)
+
+
+def test_sdsef_is_judged_where_it_was_not_trained(monkeypatch):
+    shown = datasets.unstable_spiral(1, 100)
+    ds = tuning.HeldOut(3, n_layers=2, n_features=8, epochs=2)
+    trained = []
+    learn = ds.learner.fit
+    monkeypatch.setattr(ds.learner, "fit", lambda d, progress: (trained.append(d), learn(d))[1])
+    ds.fit(shown)
+    assert len(trained[0]) == 70  # 30 of 98 between the ends are held out
+    assert trained[0].duration == pytest.approx(shown.duration)
+    torch.testing.assert_close(ds.attractor, shown.goal)
+    whole = (ds(shown.positions) - shown.velocities).square().mean(1).detach().numpy()
+    assert whole.min() < ds.fit_report.mse < whole.max()
+
+
+@pytest.mark.parametrize("n", [2, 3, 5])
+def test_the_explicit_laplacian_has_the_eigenvalues_of_the_blocks(n):
+    values = np.linalg.eigvalsh(claims.laplacian(20, n))
+    for eigenvalue in chebyshev_eigenvalues(20, n):
+        assert np.abs(values - eigenvalue).min() < 1e-12
+    assert claims.laplacian(20, n).sum() == 0
+
+
+def test_slope_is_the_exponent():
+    counts = np.array([10, 100, 1000])
+    frame = pd.DataFrame({"n": 3, "N": counts, "entry": 7.0 / counts**2})
+    assert claims.slope(frame, 3, "entry") == pytest.approx(-2)
+
+
+def test_repeated_eigenvalues_for_even_and_odd_n():
+    found = claims.spectrum((2, 3), 20)
+    assert list(found["of the n smallest"]) == [2, 2]
+    assert list(found["distinct"]) == [20, 20]
+
+
+@pytest.mark.parametrize("method", ["Chebyshev", "FDM"])
+def test_variants_differ_from_the_method_in_one_thing(method):
+    shown = datasets.unstable_spiral(1, 200)
+    setting = Setting(0.5, 0.9, 40)
+    plain = claims.KINDS[method](3, n_layers=40, beta=0.5, mu=0.9).fit(shown)
+    times = shown.times
+    same, decoupled, off = (
+        claims.Variant(3, claims.KINDS[method], setting, kappa, exact).fit(shown)
+        for kappa, exact in ((None, True), (5.0, True), (None, False))
+    )
+    path = plain.rollout(shown.start, times)
+    torch.testing.assert_close(same.rollout(shown.start, times), path)
+    torch.testing.assert_close(decoupled.rollout(shown.start, times), path)  # which is on the axis
+    aside = shown.start + 0.1
+    assert (decoupled.rollout(aside, times) - plain.rollout(aside, times)).abs().max() > 1e-3
+    torch.testing.assert_close(off.attractor, plain.decode(shown.goal))
+    assert (off.attractor - shown.goal).norm() > 1e-9
+    torch.testing.assert_close(off.rollout(shown.start, 20 * times)[-1], off.attractor, atol=1e-6, rtol=0)
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    plan = paper.Plan(
+        spirals=("unstable c=7", "stable c=3"), sensitive=("stable c=3",), grid=SMALL, official=(2, 8), tuned=(2, 8),
+        printed=False, patience=2, layers=(2,), features=(8,), epochs=2, strokes=("hook",), lasa=(), arms=1,
+    )  # fmt: skip
+    monkeypatch.setattr(paper, "QUICK", plan)
+    monkeypatch.setattr(paper, "Protocol", lambda radius=0.1: Protocol(3, radius, 40))
+    monkeypatch.setattr(tuning, "ONE_START", Protocol(0, n_points=40))
+    monkeypatch.setitem(sdsef.PLANS, "tuned", replace(sdsef.PLANS["tuned"], epochs=16))
+
+
+def command(*arguments):
+    app = typer.Typer()
+    app.command()(paper.main)
+    return CliRunner().invoke(app, ["--quick", "--jobs", "1", *map(str, arguments)], catch_exceptions=False)
+
+
+def test_the_command_writes_a_report_and_goes_on_where_it_stopped(tiny, tmp_path, monkeypatch):
+    arguments = ("--out", tmp_path, "--doc", tmp_path / "docs" / "reproduction.md")
+    assert command(*arguments).exit_code == 0
+    written = (tmp_path / "docs" / "reproduction.md").read_text()
+    assert "A quick run" in written
+    summary = written.split("## Summary")[1].split("##")[0]
+    assert "contradicted: O(1/N)" in summary
+    assert "contradicted for odd n" in summary
+    assert all(line.count("|") == 5 for line in summary.strip().splitlines())
+    pictures = [line.split("](")[1].split(")")[0] for line in written.splitlines() if line.startswith("![")]
+    assert len(pictures) >= 8
+    assert all((tmp_path / "docs" / picture).stat().st_size > 5000 for picture in pictures)
+
+    def again(*_):
+        raise AssertionError("computed anew")
+
+    monkeypatch.setattr(benchmark, "evaluate", again)
+    assert command(*arguments).exit_code == 0
+
+
+def test_recordings_come_from_a_folder(tmp_path):
+    datasets.joint_motion(0, 50).save(tmp_path / "b.npz")
+    datasets.joint_motion(1, 50).save(tmp_path / "a.csv")
+    assert [shown.dim for shown in paper.recordings(tmp_path)] == [7, 7]
+    with pytest.raises(ValueError, match="data: expected a folder"):
+        paper.recordings(tmp_path / "nothing")
