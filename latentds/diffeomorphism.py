@@ -1,4 +1,4 @@
-"""Diffeomorphisms ψ of R^n, always latent -> demonstration, with inverse, tangent map and determinant in closed form."""
+"""Diffeomorphisms ψ of R^n, always latent -> demonstration; inverse, tangent map and determinant in closed form."""
 
 from __future__ import annotations
 

@@ -18,7 +18,8 @@ def chebyshev_eigenvalues(n_points: int, dim: int) -> Array:
 
     The graph is K copies of a path of N nodes whose last nodes form a K-cycle (paper, Sec. IV). Its Laplacian splits
     into K tridiagonal blocks (paper, Prop. 2): diagonal 1, 2, …, 2, 3 - 2cos(2πj/K), off-diagonal -1. With
-    λ = 2 - 2cos θ the last row asks cos((N+½)θ) = (2cos(2πj/K) - 1) cos((N-½)θ), whose smallest root lies in (0, π/(2N-1)).
+    λ = 2 - 2cos θ the last row asks cos((N+½)θ) = (2cos(2πj/K) - 1) cos((N-½)θ); its smallest root lies in
+    (0, π/(2N-1)).
 
     λN² → π²/4. Blocks j and K-j agree; for odd n the block j = K/2 stands alone, so "n repeating eigenvalues" (paper,
     Sec. IV-B) holds for even n only.
