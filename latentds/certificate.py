@@ -130,8 +130,8 @@ class _Search:
             self.velocity = ds(self.points)
             speed = torch.linalg.vector_norm(self.velocity, dim=-1)
         finite = speed[torch.isfinite(speed)]
-        self.speed = float(finite.median()) if len(finite) else math.nan
-        self.duration = self.size / self.speed if self.speed > 0 else 1.0
+        self.speed = max(float(finite.median()) if len(finite) else 0.0, torch.finfo(self.goal.dtype).tiny)
+        self.duration = self.size / self.speed
 
     def lines(self) -> list[Line]:
         found = [self._finite()]

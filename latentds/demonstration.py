@@ -18,6 +18,8 @@ from .arguments import point_array, positive, real_array
 
 MAX_BYTES = 2**30
 """Largest file of a demonstration that is read, unpacked: a hostile one could name any size."""
+CLOSED = 1e-6
+"""Distance of the goal from the start, in sizes of the motion, up to which it counts as a closed loop."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,6 +229,15 @@ def demonstrations_of(demonstration: Any, dim: int) -> list[Demonstration]:
         if item.dim != dim:
             raise ValueError(f"demonstration: expected dimension {dim}, got {item.dim} ({item!r})")
     return list(found)
+
+
+def goal_apart(shown: Demonstration) -> float:
+    """Distance of the goal from the start; a ValueError if it vanishes beside the motion's size."""
+    gap = float(torch.linalg.vector_norm(shown.goal - shown.start))
+    if not gap > CLOSED * shown.size:
+        share = f"{gap / shown.size:.1e} of its size"
+        raise ValueError(f"demonstration: expected a goal apart from the start, got a closed loop ({share})")
+    return gap
 
 
 def only_demonstration(demonstration: Any, dim: int, method: str) -> Demonstration:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -11,7 +13,7 @@ from numpy.typing import NDArray
 
 from . import kernels
 from .base import FitReport, LatentDS
-from .demonstration import Demonstration
+from .demonstration import Demonstration, goal_apart
 from .diffeomorphism import WIDTH_BOUND, Layers, LocallyWeightedTranslations
 from .isotopy import straight_isotopy
 from .refinement import refine
@@ -81,17 +83,40 @@ def settle(
     psi, dynamics = ds.diffeomorphism, ds.dynamics
     assert isinstance(psi, LocallyWeightedTranslations)
     assert isinstance(dynamics, RayDynamics)
-    if bool((shown.start == shown.goal).all()):
-        raise ValueError("demonstration: expected a goal apart from the start, got a closed loop")
     points = shown.positions.numpy()
-    layers = match_along(straight_isotopy(latent, points, steps), psi.n_layers, beta, mu)
-    if refined:
-        layers = refine(layers, latent, points, mu)
-    psi.assign(*(torch.from_numpy(part) for part in layers))
-    dynamics.law = law.to(ds.attractor)
-    with torch.no_grad():
-        ds.attractor.copy_(shown.goal)
-        dynamics.aim(psi.inverse(shown.start.to(ds.attractor)), psi.inverse(ds.attractor))
-        missed = psi(torch.from_numpy(latent).to(ds.attractor)) - shown.positions.to(ds.attractor)
-    mse, seconds = float(missed.square().mean()), time.perf_counter() - began
-    ds.fit_report = FitReport(mse, psi.n_layers, seconds, learned_from=(shown.fingerprint,))
+    with fitting(ds, shown):
+        layers = match_along(straight_isotopy(latent, points, steps), psi.n_layers, beta, mu)
+        if refined:
+            layers = refine(layers, latent, points, mu)
+        psi.assign(*(torch.from_numpy(part) for part in layers))
+        dynamics.law = law.to(ds.attractor)
+        with torch.no_grad():
+            ds.attractor.copy_(shown.goal)
+            dynamics.aim(psi.inverse(shown.start.to(ds.attractor)), psi.inverse(ds.attractor))
+            missed = psi(torch.from_numpy(latent).to(ds.attractor)) - shown.positions.to(ds.attractor)
+        mse, seconds = float(missed.square().mean()), time.perf_counter() - began
+        ds.fit_report = FitReport(mse, psi.n_layers, seconds, learned_from=(shown.fingerprint,))
+
+
+@contextmanager
+def fitting(ds: LatentDS, shown: Demonstration) -> Iterator[None]:
+    """A fit to a motion that ends apart from its start; one that fails leaves ``ds`` as it was.
+
+    Invertible on paper is not invertible in floats: a map that does not lead back is refused.
+    """
+    gap = goal_apart(shown)
+    before, report = {name: value.clone() for name, value in ds.state_dict().items()}, ds.fit_report
+    try:
+        yield
+        with torch.no_grad():
+            points = shown.positions.to(ds.attractor)
+            off = float((ds.decode(ds.encode(points)) - points).abs().max()) / gap
+            if not off < torch.finfo(points.dtype).eps ** 0.4:
+                raise ValueError(
+                    "demonstration: expected a motion whose map inverts in floats, got one that comes back off by "
+                    f"{off:.1e} of the way from start to goal, which is {gap / shown.size:.1e} of its size"
+                )
+    except BaseException:
+        ds.load_state_dict(before)
+        ds.fit_report = report
+        raise

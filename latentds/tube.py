@@ -19,7 +19,7 @@ from .demonstration import Demonstration, demonstrations_of
 from .diffeomorphism import Layers, LocallyWeightedTranslations
 from .embedding import arc_length_path, place, straight_column
 from .isotopy import straight_isotopy, unbending_isotopy
-from .matching import match_along
+from .matching import fitting, match_along
 from .metrics import dtw
 from .refinement import refine
 from .time_law import PiecewiseLinearLaw, TubeDynamics
@@ -96,23 +96,24 @@ class TubeDS(LatentDS):
         shown, spread = mean_motion(every)
         path, way, times = arc_length_path(shown.positions.numpy(), shown.times.numpy(), N_POINTS)
         _refuse_crossings(path)
-        law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
-        judged = []
-        for candidate in _candidates(path, self.psi.n_layers):
-            self._lay(candidate, shown, law)
-            judged.append((self._score(shown), candidate))
-        judged.sort(key=lambda pair: pair[0])
-        if self.refined:
-            for tried, (_, candidate) in enumerate(list(judged)):
-                if tried and min(score for score, _ in judged) < (ENOUGH if tried < 3 else 3 * ENOUGH):
-                    break
-                better = candidate.refined(path)
-                self._lay(better, shown, law)
-                judged.append((self._score(shown), better))
-        best = min(judged, key=lambda pair: pair[0])[1]
-        self._lay(best, shown, law)
-        report = self._report(best, path, shown, spread, began)
-        self.fit_report = replace(report, learned_from=tuple(one.fingerprint for one in every))
+        with fitting(self, shown):
+            law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
+            judged = []
+            for candidate in _candidates(path, self.psi.n_layers):
+                self._lay(candidate, shown, law)
+                judged.append((self._score(shown), candidate))
+            judged.sort(key=lambda pair: pair[0])
+            if self.refined:
+                for tried, (_, candidate) in enumerate(list(judged)):
+                    if tried and min(score for score, _ in judged) < (ENOUGH if tried < 3 else 3 * ENOUGH):
+                        break
+                    better = candidate.refined(path)
+                    self._lay(better, shown, law)
+                    judged.append((self._score(shown), better))
+            best = min(judged, key=lambda pair: pair[0])[1]
+            self._lay(best, shown, law)
+            report = self._report(best, path, shown, spread, began)
+            self.fit_report = replace(report, learned_from=tuple(one.fingerprint for one in every))
         return self
 
     @property
@@ -254,8 +255,8 @@ def _refuse_crossings(path: Array) -> None:
     b, c, f = (step[first] * step[second]).sum(1), (step[first] * gap).sum(1), (step[second] * gap).sum(1)
     denominator = a * e - b * b
     s = np.clip(np.where(denominator > 1e-12 * a * e, (b * f - c * e) / np.maximum(denominator, 1e-300), 0.0), 0, 1)
-    t = np.clip((b * s + f) / e, 0, 1)
-    s = np.clip((b * t - c) / a, 0, 1)
+    t = np.clip((b * s + f) / np.maximum(e, 1e-300), 0, 1)
+    s = np.clip((b * t - c) / np.maximum(a, 1e-300), 0, 1)
     near = np.linalg.norm(gap + s[:, None] * step[first] - t[:, None] * step[second], axis=1)
     worst = int(np.argmin(near))
     if near[worst] < 1e-7 * np.ptp(path, axis=0).max():

@@ -10,7 +10,7 @@ import torch
 from scipy.optimize import minimize_scalar
 
 from baselines import FDM
-from latentds import ChebyshevDS, Demonstration, datasets
+from latentds import ChebyshevDS, Demonstration, TubeDS, datasets
 from latentds.diffeomorphism import WIDTH_BOUND
 from latentds.embedding import chebyshev_columns, place, straight_column
 from latentds.matching import match
@@ -185,3 +185,27 @@ def test_bad_demonstrations(method):
             ds.fit(demonstration)
         assert ds.fit_report is None
         assert bool((ds.attractor == 0).all())
+
+
+@pytest.mark.parametrize("method", [*TABLE_I, TubeDS], ids=lambda method: method.__name__)
+@pytest.mark.parametrize("gap", [0.0, 1e-7])
+def test_a_fit_that_fails_leaves_the_last_one(method, gap):
+    """Here the goal lies so near the start that no latent line leads from one to the other."""
+    ds = method(2, n_layers=20).fit(wavy_motion(2))
+    before, report = {name: value.clone() for name, value in ds.state_dict().items()}, ds.fit_report
+    t = torch.linspace(0, 1.5 * math.pi, 50, dtype=torch.float64)
+    bow = torch.stack([torch.cos(t), torch.sin(t)], dim=1)
+    bow[-1] = bow[0] + gap
+    with pytest.raises(ValueError, match=r"got a closed loop|does not meet itself"):
+        ds.fit(Demonstration(bow, 0.1))
+    assert ds.fit_report is report
+    assert all(torch.equal(value, before[name]) for name, value in ds.state_dict().items())
+
+
+def test_a_map_that_floats_cannot_invert_is_refused(monkeypatch):
+    ds = FDM(2, n_layers=20)
+    monkeypatch.setattr(ds.diffeomorphism, "inverse", lambda y: y * (1 + 1e-3))
+    with pytest.raises(ValueError, match="demonstration: expected a motion whose map inverts in floats, got one that"):
+        ds.fit(wavy_motion(2))
+    assert ds.fit_report is None
+    assert bool((ds.attractor == 0).all())

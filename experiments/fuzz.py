@@ -1,0 +1,252 @@
+"""Hostile demonstrations: each ends in a stable system that its certificate does not falsify, or in a ValueError.
+
+Run it with ``make fuzz``; ``ARGS="--cases 5000 --seed 3"`` changes what is tried. Leaves results/fuzz/cases.csv.
+"""
+
+from __future__ import annotations
+
+import csv
+import faulthandler
+import math
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import torch
+import typer
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import seed as seeded
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from baselines import FDM
+from latentds import ChebyshevDS, Demonstration, StableDS, TubeDS, certify
+
+METHODS: dict[str, Callable[[int], StableDS]] = {
+    "ChebyshevDS": lambda dim: ChebyshevDS(dim, n_layers=40),
+    "FDM": lambda dim: FDM(dim, n_layers=40),
+    "TubeDS": lambda dim: TubeDS(dim, n_layers=40, refined=False),
+}
+SHAPES = (
+    "smooth",
+    "walk",
+    "zigzag",
+    "collinear",
+    "one axis",
+    "spiral",
+    "corners",
+    "loop",
+    "crossing",
+    "there and back",
+)
+FLAWS = (
+    "none",
+    "noise",
+    "pause",
+    "rest at start",
+    "rest at end",
+    "repeats",
+    "jump",
+    "near loop",
+    "nan",
+    "inf",
+    "equal",
+)
+FORMS = ("float64", "float32", "float16", "int64", "strided", "transposed", "requires_grad", "numpy", "list")
+HANG = 60.0
+"""Seconds after which a case counts as hung."""
+
+
+class Case(NamedTuple):
+    """How to make one demonstration; everything in it is drawn by hypothesis."""
+
+    method: str
+    shape: str
+    flaw: str
+    form: str
+    n_points: int
+    dim: int
+    scale: float
+    offset: float
+    dt: float
+    seed: int
+
+    def positions(self) -> Any:
+        """The motion, (N, n), in the form that it is handed over in."""
+        draw = np.random.default_rng(self.seed)
+        path = self.scale * _flawed(_path(self.shape, self.n_points, self.dim, draw), self.flaw, draw) + self.offset
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _handed_over(path, self.form)
+
+
+def _path(shape: str, count: int, dim: int, draw: np.random.Generator) -> NDArray[np.float64]:
+    t = np.linspace(0, 1, count)[:, None]
+    axis = draw.normal(size=dim)
+    if shape == "smooth":
+        return np.asarray(np.sin(2 * np.pi * (draw.uniform(0.2, 1.0, dim) * t + draw.uniform(0, 1, dim))) - 2 * t)
+    if shape == "walk":
+        return np.cumsum(draw.normal(size=(count, dim)), axis=0) / math.sqrt(count)
+    if shape == "zigzag":
+        return np.asarray(t * axis + 0.2 * (np.arange(count)[:, None] % 2) * draw.normal(size=dim))
+    if shape == "collinear":
+        return np.asarray(t * axis)
+    if shape == "one axis":
+        return np.asarray(t * np.eye(dim)[0])
+    if shape == "spiral":
+        turns = draw.uniform(1, 8)
+        waves = np.stack([(1 - t[:, 0]) * np.cos(2 * np.pi * turns * t[:, 0] + k) for k in range(dim)], axis=1)
+        return np.asarray(waves)
+    if shape == "corners":
+        knots = draw.normal(size=(4, dim))
+        return np.stack([np.interp(t[:, 0], np.linspace(0, 1, 4), column) for column in knots.T], axis=1)
+    if shape == "loop":
+        angle = 2 * np.pi * t[:, 0]
+        path = np.stack([np.cos(angle + k) for k in range(dim)], axis=1)
+        path[-1] = path[0]
+        return np.asarray(path)
+    if shape == "crossing":
+        return np.stack([np.sin((k + 1) * np.pi * 1.7 * t[:, 0]) for k in range(dim)], axis=1)
+    return np.asarray(np.minimum(t, 1.2 - t) * axis)  # there and back
+
+
+def _flawed(path: NDArray[np.float64], flaw: str, draw: np.random.Generator) -> NDArray[np.float64]:
+    count, middle = len(path), len(path) // 2
+    path = path.copy()
+    if flaw == "noise":
+        path += 10.0 ** draw.uniform(-12, -1) * draw.normal(size=path.shape)
+    elif flaw == "pause":
+        path[middle : middle + max(1, count // 3)] = path[middle]
+    elif flaw == "rest at start":
+        path[:middle] = path[0]
+    elif flaw == "rest at end":
+        path[middle:] = path[-1]
+    elif flaw == "repeats":
+        path = path[np.sort(draw.integers(0, count, count))]
+    elif flaw == "jump":
+        path[middle:] += 100 * draw.normal(size=path.shape[1])
+    elif flaw == "near loop":
+        path[-1] = path[0] + 10.0 ** draw.uniform(-15, -3) * draw.normal(size=path.shape[1])
+    elif flaw == "hopeless":
+        rows = draw.choice([0, draw.integers(count)])
+        path[rows:] = draw.choice([math.nan, math.inf, path[0, 0]])
+    return path
+
+
+def _handed_over(path: NDArray[np.float64], form: str) -> Any:
+    if form in ("float32", "float16", "int64"):
+        return torch.from_numpy(path.astype(form))
+    if form == "strided":
+        wide = np.zeros((2 * len(path), 3 * path.shape[1]))
+        wide[::2, ::3] = path
+        return torch.from_numpy(wide)[::2, ::3]
+    if form == "transposed":
+        return torch.from_numpy(np.ascontiguousarray(path.T)).T
+    if form == "requires_grad":
+        return torch.from_numpy(path).requires_grad_()
+    if form == "list":
+        return path.tolist()
+    return path if form == "numpy" else torch.from_numpy(path)
+
+
+def cases(largest: int = 5000) -> st.SearchStrategy[Case]:
+    """Demonstrations with N from 3 to ``largest`` points in 1 to 10 dimensions, at scales from 1e-9 to 1e9."""
+    counts = st.one_of(st.integers(3, 12), st.integers(13, 300), st.integers(301, max(301, largest)))
+    return st.builds(
+        Case,
+        st.sampled_from(sorted(METHODS)),
+        st.sampled_from(SHAPES),
+        st.sampled_from(FLAWS),
+        st.sampled_from(FORMS),
+        counts.map(lambda count: min(count, largest)),
+        st.integers(1, 10),
+        st.floats(-9, 9).map(lambda power: 10.0**power),
+        st.sampled_from([0.0, 0.0, 1.0, -1e3, 1e6]),
+        st.sampled_from([1e-2, 1e-6, 1.0, 1e4]),
+        st.integers(0, 2**32 - 1),
+    )
+
+
+def outcome(case: Case) -> str:
+    """What became of a case: "stable", "ValueError: …", or, if the promise is broken, "BROKEN …"."""
+    try:
+        shown = Demonstration(case.positions(), case.dt)
+        ds = METHODS[case.method](case.dim).fit(shown)
+    except ValueError as error:
+        text = str(error)
+        named = text.startswith(("positions: ", "demonstration: ", "dt: "))
+        return f"ValueError: {text}" if named else f"BROKEN a ValueError that names no argument: {text}"
+    except Exception as error:
+        return f"BROKEN {type(error).__name__}: {error}"
+    try:
+        with torch.no_grad():
+            path = ds.rollout(shown.start, torch.linspace(0, shown.duration, 50, dtype=torch.float64))
+        if not bool(torch.isfinite(path).all() and torch.isfinite(ds(path)).all()):
+            return "BROKEN NaN or inf in a rollout from the demonstrated start"
+        certificate = certify(ds, n_samples=40)
+    except Exception as error:
+        return f"BROKEN after the fit, {type(error).__name__}: {error}"
+    if not certificate.holds:
+        return "BROKEN certificate: " + "; ".join(str(line) for line in certificate.falsified)
+    return "stable"
+
+
+def summary(results: list[tuple[Case, str, float]]) -> str:
+    """Outcomes by kind, the commonest first."""
+    kinds = Counter(_kind(found) for _, found, _ in results)
+    slowest = max(seconds for *_, seconds in results)
+    lines = [f"{count:6d}  {kind}" for kind, count in kinds.most_common()]
+    return "\n".join([f"{len(results)} cases, slowest {slowest:.1f} s", *lines])
+
+
+def _kind(found: str) -> str:
+    if found.startswith("BROKEN certificate"):
+        return found.split(" (")[0]
+    return found.split(", got")[0].split(" that comes back to")[0][:110]
+
+
+def main(
+    n_cases: Annotated[int, typer.Option("--cases", min=1, help="How many to try.")] = 1000,
+    seed: Annotated[int, typer.Option(min=0, help="Of hypothesis.")] = 0,
+    largest: Annotated[int, typer.Option(min=3, help="Most points in a demonstration.")] = 5000,
+    out: Annotated[Path, typer.Option(help="Folder for cases.csv.")] = Path("results/fuzz"),
+) -> None:
+    """Try hostile demonstrations and print a summary by outcome; exit code 1 if the promise was broken."""
+    results: list[tuple[Case, str, float]] = []
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, TimeRemainingColumn()) as bar:
+        task = bar.add_task("hostile demonstrations", total=n_cases)
+
+        @seeded(seed)
+        @settings(
+            max_examples=n_cases, deadline=None, database=None, phases=[Phase.generate],
+            suppress_health_check=list(HealthCheck),
+        )  # fmt: skip
+        @given(cases(largest))
+        def attempt(case: Case) -> None:
+            faulthandler.dump_traceback_later(HANG, exit=True)
+            began = time.perf_counter()
+            found = outcome(case)
+            faulthandler.cancel_dump_traceback_later()
+            results.append((case, found, time.perf_counter() - began))
+            if found.startswith("BROKEN"):
+                bar.console.print(f"{case}\n{found}\n", markup=False, highlight=False)
+            broken = sum(text.startswith("BROKEN") for _, text, _ in results)
+            bar.update(task, advance=1, description=f"hostile demonstrations, {broken} broken promises")
+
+        attempt()
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / "cases.csv").open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow([*Case._fields, "outcome", "seconds"])
+        table.writerows([*case, found, f"{seconds:.3f}"] for case, found, seconds in results)
+    print(summary(results))
+    sys.exit(any(found.startswith("BROKEN") for _, found, _ in results))
+
+
+if __name__ == "__main__":
+    typer.run(main)

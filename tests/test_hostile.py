@@ -1,0 +1,203 @@
+"""Hostile demonstrations, hostile inputs to fitted systems, threads and processes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import seed as seeded
+
+from baselines import FDM, SDSEF
+from experiments.fuzz import METHODS, Case, cases, outcome, summary
+from latentds import ChebyshevDS, TubeDS, datasets
+from latentds.testing import wavy_motion
+
+
+@seeded(7)
+@settings(
+    max_examples=60, deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck)
+)
+@given(cases(largest=400))
+def test_hostile_demonstrations(case):
+    found = outcome(case)
+    assert not found.startswith("BROKEN"), f"{case}: {found}"
+
+
+PLAIN = Case("FDM", "smooth", "none", "float64", 100, 2, 1.0, 0.0, 0.01, 0)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_harmless_demonstrations_are_fitted(method):
+    for dim in (1, 2, 3):
+        assert outcome(PLAIN._replace(method=method, dim=dim)) == "stable"
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("form", ["float32", "float16", "strided", "transposed", "requires_grad", "numpy", "list"])
+def test_every_form_is_taken(method, form):
+    assert outcome(PLAIN._replace(method=method, form=form)) == "stable"
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize(("scale", "offset"), [(1e-9, 0.0), (1e9, 0.0), (1.0, 1e6)])
+def test_every_scale_is_taken(method, scale, offset):
+    assert outcome(PLAIN._replace(method=method, scale=scale, offset=offset, dim=3)) == "stable"
+
+
+def test_the_fuzzer_tells_a_broken_promise(monkeypatch):
+    class Unstable(FDM):
+        def forward(self, y):
+            return -super().forward(y)
+
+    class Crashes(FDM):
+        def fit(self, demonstration, *, progress=False):
+            raise IndexError("off by one")
+
+    class Mumbles(FDM):
+        def fit(self, demonstration, *, progress=False):
+            raise ValueError("no")
+
+    for broken, message in {Unstable: "V decreases", Crashes: "IndexError: off by one", Mumbles: "names no"}.items():
+        monkeypatch.setitem(METHODS, "broken", broken)
+        found = outcome(PLAIN._replace(method="broken"))
+        assert found.startswith("BROKEN")
+        assert message in found
+        assert "1  BROKEN" in summary([(PLAIN, found, 0.1)])
+
+
+@pytest.fixture(scope="module", params=["ChebyshevDS", "FDM", "TubeDS", "SDSEF"])
+def ds(request):
+    """Fitted, but SDS-EF, whose couplings are shaken instead: training takes long and changes nothing here."""
+    shown = datasets.unstable_spiral(1, 200)
+    if request.param != "SDSEF":
+        return METHODS[request.param](3).fit(shown)
+    system = SDSEF(3, n_layers=4, n_features=20, seed=0)
+    with torch.no_grad():
+        for parameter in system.diffeomorphism.parameters():
+            parameter.normal_(0, 0.02, generator=torch.Generator().manual_seed(0))
+        system.dynamics.attractor.copy_(system.encode(system.attractor))
+    return system
+
+
+def calls(ds):
+    times = torch.tensor([0.0, 0.5, 3.0])
+    return {
+        "forward": ds,
+        "lyapunov": ds.lyapunov,
+        "encode": ds.encode,
+        "decode": ds.decode,
+        "jacobian": ds.jacobian,
+        "rollout": lambda y: ds.rollout(y, times),
+    }
+
+
+@torch.no_grad()
+def test_far_away_nothing_breaks(ds, draw):
+    y = 1e6 * torch.randn(50, 3, generator=draw, dtype=torch.float64)
+    for name, call in calls(ds).items():
+        assert torch.isfinite(call(y)).all(), name
+    if isinstance(ds, SDSEF):
+        return  # couplings multiply 1e6 by functions of 1e6, layer after layer: no float carries them back exactly
+    assert (ds.decode(ds.encode(y)) - y).abs().max() < 1e-3
+    energy = ds.lyapunov(ds.rollout(y, torch.tensor([0.0, 1.0, 10.0])))
+    assert (energy.diff(dim=-1) <= 1e-9 * energy.amax()).all()
+
+
+@torch.no_grad()
+def test_at_the_attractor_nothing_breaks(ds):
+    y = ds.attractor.expand(3, 3)
+    for name, call in calls(ds).items():
+        assert torch.isfinite(call(y)).all(), name
+    assert ds(y).abs().max() < 1e-9
+    assert (ds.rollout(y, torch.tensor([0.0, 1e6])) - ds.attractor).abs().max() < 1e-9
+    nearly = ds.attractor + torch.tensor([1e-300, 1e-160, 5e-324], dtype=torch.float64)
+    assert torch.isfinite(ds(nearly)).all()
+    assert torch.isfinite(ds.rollout(nearly, torch.tensor([0.0, 1.0]))).all()
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf"), 1e308])
+@pytest.mark.parametrize("count", [3, 50])
+@torch.no_grad()
+def test_a_bad_row_spoils_itself_alone(ds, draw, bad, count):
+    y = torch.randn(count, 3, generator=draw, dtype=torch.float64)
+    spoiled = y.clone()
+    spoiled[1, 2] = bad
+    others = torch.arange(count) != 1
+    for name, call in calls(ds).items():
+        found, wanted = call(spoiled), call(y)
+        torch.testing.assert_close(found[others], wanted[others], rtol=1e-6, atol=1e-9, msg=name)
+        if np.isnan(bad) and name != "rollout":
+            assert found[1].isnan().any(), name
+
+
+def test_gradients_are_finite_far_away_and_at_the_attractor(ds):
+    for y in (1e6 * torch.ones(3, dtype=torch.float64), ds.attractor.clone()):
+        point = y.clone().requires_grad_()
+        (ds(point).sum() + ds.lyapunov(point) + ds.rollout(point, torch.tensor([0.0, 1.0])).sum()).backward()
+        assert torch.isfinite(point.grad).all()
+
+
+@torch.no_grad()
+def test_eight_threads_give_the_serial_result(ds, draw):
+    batches = [torch.randn(n, 3, generator=draw, dtype=torch.float64) for n in (1, 7, 40, 20) * 6]
+    times = torch.linspace(0, 1, 5)
+
+    def evaluate(y):
+        return torch.cat([ds(y), ds.encode(y), ds.rollout(y, times).flatten(0, 1)])
+
+    serial = [evaluate(y) for y in batches]
+    with ThreadPoolExecutor(8) as pool:
+        for found, wanted in zip(pool.map(evaluate, batches), serial, strict=True):
+            torch.testing.assert_close(found, wanted, rtol=1e-13, atol=1e-13)
+
+
+def test_eight_threads_fit_as_one_does():
+    motions = [wavy_motion(3, seed) for seed in range(8)]
+
+    def fit(shown):
+        ds = ChebyshevDS(3, n_layers=30).fit(shown)
+        with torch.no_grad():
+            return ds(shown.positions)
+
+    serial = [fit(shown) for shown in motions]
+    with ThreadPoolExecutor(8) as pool:
+        for found, wanted in zip(pool.map(fit, motions), serial, strict=True):
+            torch.testing.assert_close(found, wanted, rtol=1e-13, atol=1e-13)
+
+
+def _in_another_process(ds, y, queue):
+    with torch.no_grad():
+        refitted = FDM(3, n_layers=10).fit(datasets.unstable_spiral(1, 100))
+        queue.put((ds(y).numpy(), ds.rollout(y, torch.linspace(0, 1, 5)).numpy(), refitted(y).numpy()))
+
+
+@pytest.mark.parametrize("how", ["fork", "spawn"])
+@pytest.mark.filterwarnings(
+    "ignore::DeprecationWarning"
+)  # Python warns of fork in a threaded process; that is the test
+def test_other_processes_give_the_same_result(how, draw):
+    if how not in multiprocessing.get_all_start_methods():
+        pytest.skip(f"no {how} on {sys.platform}")
+    ds, y = TubeDS(3, n_layers=20, refined=False).fit(wavy_motion(3)), torch.randn(300, 3, generator=draw).double()
+    context = multiprocessing.get_context(how)
+    queue = context.Queue()
+    with torch.no_grad():
+        wanted = (
+            ds(y),
+            ds.rollout(y, torch.linspace(0, 1, 5)),
+            FDM(3, n_layers=10).fit(datasets.unstable_spiral(1, 100))(y),
+        )
+    process = context.Process(target=_in_another_process, args=(ds, y, queue))
+    process.start()
+    try:
+        for found, expected in zip(queue.get(timeout=120), wanted, strict=True):
+            np.testing.assert_allclose(found, expected.numpy(), rtol=1e-12, atol=1e-12)
+        process.join(30)
+        assert process.exitcode == 0
+    finally:
+        process.kill()
