@@ -1,5 +1,6 @@
 """The head-to-head's tables say what its rows say."""
 
+import itertools
 import json
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from experiments import spirals
-from latentds import ChebyshevDS
+from latentds import ChebyshevDS, benchmark
 from latentds.benchmark import COLUMNS
 
 
@@ -33,6 +34,7 @@ def summary_of(rows):
     return spirals.summarize(rows, ["unstable c=3", "unstable c=7"], ["Chebyshev", "FDM"])
 
 
+@pytest.mark.filterwarnings("ignore:Precision loss")  # made-up scores differ by a constant
 def test_means_spreads_and_the_best_in_bold():
     rows = made_up(lambda m, d, s: 100 if s == 0 else s + (10 if m == "FDM" else 0))
     found = line(summary_of(rows), "exact DTW over", "unstable c=7")
@@ -48,6 +50,7 @@ def test_p_values_are_paired_and_welchs():
     assert float(paired) < 0.001 < 0.5 < float(welch)  # a small, steady difference under a large shared spread
 
 
+@pytest.mark.filterwarnings("ignore:Precision loss")  # made-up scores differ by a constant
 def test_fast_dtw_that_differs_is_marked():
     rows = made_up(lambda m, d, s: 10.0 + 1e-3 * s)
     rows.loc[(rows["method"] == "FDM") & (rows["demonstration"] == "unstable c=3"), "dtw_fast"] = 10.6
@@ -97,7 +100,7 @@ def test_the_command_leaves_rows_summary_settings_and_pictures(small, tmp_path):
     assert result.exit_code == 0, result.output
     found = {path.name for path in (tmp_path / "new").iterdir()}
     pictures = {"unstable_c3.png", "unstable_c7.png", "stable_c2.png", "dtw_unstable.png", "dtw_stable.png"}
-    assert found == {"rows.csv", "summary.md", "settings.json"} | pictures
+    assert found == {"rows.csv", "summary.md", "settings.json", "cells.sqlite"} | pictures
     rows = pd.read_csv(tmp_path / "new" / "rows.csv")
     assert len(rows) == 3 * 2 * 21
     assert "unstable c=7" in result.output
@@ -105,3 +108,16 @@ def test_the_command_leaves_rows_summary_settings_and_pictures(small, tmp_path):
     assert settings["Chebyshev"]["unstable c=7"]["n_layers"] == 175
     assert settings["environment"]["packages"]["torch"]
     assert settings["protocol"] == {"n_starts": 20, "radius": 0.1, "n_points": 500}
+
+
+def test_an_interrupted_command_tells_what_is_done(small, tmp_path, monkeypatch):
+    def stopped(*arguments, **settings):
+        yield from itertools.islice(benchmark.run(*arguments, **settings), 1)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(spirals, "run", stopped)
+    result = command("--out", tmp_path)
+    assert result.exit_code == 130
+    assert "Interrupted: 1 of 6 cells are done" in result.output
+    assert len(pd.read_csv(tmp_path / "rows.csv")) == 21
+    assert (tmp_path / "dtw_unstable.png").exists()
