@@ -53,9 +53,9 @@ STRAIGHT = {
     "unstable c=10": Setting(0.5, 0.9, 300, 5.39e-6),
     "unstable c=15": Setting(0.3, 0.8, 750, 1.56e-5),
 }
-# The paper gives none for the stable spirals. Of six tried on each (β .3 to .9, μ .8 and .9, M 100 to 400), this is the
-# one with which neither method fails on any; larger β tangles both from c = 5 on.
-STABLE = Setting(0.3, 0.8, 400)
+# The paper gives none for the stable spirals. Of 27 tried (β .2, .3, .4; μ .7, .8, .9; M 400, 600, 800), the same for
+# both methods, this has the lowest mean DTW summed over both and all five; more layers change nothing.
+STABLE = Setting(0.3, 0.9, 400)
 RIVALS = ("Chebyshev", "FDM")
 """The two that the p-values compare."""
 
