@@ -10,7 +10,7 @@ import typer
 from typer.testing import CliRunner
 
 from baselines import FDM, sdsef
-from experiments import claims, paper, tuning
+from experiments import claims, paper, sections, study, tuning
 from experiments.spirals import Setting
 from experiments.tuning import Choice, Grid, Tried, choose
 from latentds import ChebyshevDS, benchmark, datasets
@@ -105,12 +105,13 @@ def test_variants_differ_from_the_method_in_one_thing(method):
 
 @pytest.fixture
 def tiny(monkeypatch):
-    plan = paper.Plan(
+    plan = study.Plan(
         spirals=("unstable c=7", "stable c=3"), sensitive=("stable c=3",), grid=SMALL, official=(2, 8), tuned=(2, 8),
         printed=False, patience=2, layers=(2,), features=(8,), epochs=2, strokes=("hook",), lasa=(), arms=1,
     )  # fmt: skip
     monkeypatch.setattr(paper, "QUICK", plan)
-    monkeypatch.setattr(paper, "Protocol", lambda radius=0.1: Protocol(3, radius, 40))
+    for module in (study, sections):
+        monkeypatch.setattr(module, "Protocol", lambda radius=0.1: Protocol(3, radius, 40))
     monkeypatch.setattr(tuning, "ONE_START", Protocol(0, n_points=40))
     monkeypatch.setitem(sdsef.PLANS, "tuned", replace(sdsef.PLANS["tuned"], epochs=16))
 
@@ -144,6 +145,6 @@ def test_the_command_writes_a_report_and_goes_on_where_it_stopped(tiny, tmp_path
 def test_recordings_come_from_a_folder(tmp_path):
     datasets.joint_motion(0, 50).save(tmp_path / "b.npz")
     datasets.joint_motion(1, 50).save(tmp_path / "a.csv")
-    assert [shown.dim for shown in paper.recordings(tmp_path)] == [7, 7]
+    assert [shown.dim for shown in sections.recordings(tmp_path)] == [7, 7]
     with pytest.raises(ValueError, match="data: expected a folder"):
-        paper.recordings(tmp_path / "nothing")
+        sections.recordings(tmp_path / "nothing")
