@@ -366,7 +366,8 @@ def joints(study: Study, found: Report, data: Path | None) -> None:
                 f"{of['FDM']['dtw']:.2f}",
             ]
         )
-    header = ["motion", "paper's case", "Chebyshev, FastDTW", "exact", "β / μ / M: MSE", "FDM, FastDTW", "exact"]
+    header = ["motion", "paper's case (another motion)", "Chebyshev, FastDTW", "exact", "β / μ / M: MSE"]
+    header += ["FDM, FastDTW", "exact"]
     found.add(report.table(header, lines))
     values, paper = list(scores.values()), list(TABLE_THREE.values())
     found.find(
