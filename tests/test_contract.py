@@ -16,7 +16,7 @@ METHODS = {
     "ChebyshevDS": lambda dim: ChebyshevDS(dim, n_layers=30),
     "FDM": lambda dim: FDM(dim, n_layers=30),
     "SDSEF": lambda dim: SDSEF(dim, n_layers=4, n_features=20, seed=0),
-    "TubeDS": lambda dim: TubeDS(dim, n_layers=30, refined=False),
+    "TubeDS": lambda dim: TubeDS(dim, n_layers=20, refined=False),
 }
 
 
