@@ -40,8 +40,6 @@ from latentds.tube import TubeDS
 PROTOCOL = Protocol()
 NEAR = 0.05
 """Radius of the ball of starts around a recording's start, in sizes of the motion; .1 on the spirals' sphere."""
-STEPS = 20
-"""Continuation steps of ChebyshevDS and FDM."""
 KAPPAS = (0.5, 5.0, 80.0)
 """Beside the default, 20; the first is as good as none. Refinement moves the scores of off-path starts little."""
 CHOSEN = (
@@ -79,9 +77,9 @@ def methods(name: str) -> dict[str, tuple[Factory, str]]:
         beta, mu, n_layers, _ = settings.get(name, STABLE)
         for idea, steps, refined in (
             ("", 1, False),
-            (" + continuation", STEPS, False),
+            (" + continuation", steps_for(n_layers), False),
             (" + refinement", 1, True),
-            (" + both", STEPS, True),
+            (" + both", steps_for(n_layers), True),
         ):
             found[label + idea] = (
                 lambda dim, kind=kind, b=beta, m=mu, layers=n_layers, steps=steps, refined=refined: kind(
@@ -97,6 +95,11 @@ def methods(name: str) -> dict[str, tuple[Factory, str]]:
         found[label] = (lambda dim, kappa=kappa: TubeDS(dim, contraction=kappa, refined=False), "")
     found["TubeDS"] = (TubeDS, "")
     return found
+
+
+def steps_for(n_layers: int) -> int:
+    """Continuation steps: one for ten layers, as in TubeDS."""
+    return max(1, min(20, n_layers // 10))
 
 
 def trials(quick: bool, recordings: Sequence[Demonstration], handwriting: bool) -> Iterator[Trial]:
@@ -121,14 +124,14 @@ def trials(quick: bool, recordings: Sequence[Demonstration], handwriting: bool) 
 
 
 def layer_trials(shown: Demonstration) -> Iterator[Trial]:
-    """Half of the paper's layers, with continuation and refinement."""
+    """Half of the paper's layers with continuation and refinement, β and μ as in TubeDS."""
     for label, kind, settings in (("Chebyshev", ChebyshevDS, CHEBYSHEV), ("FDM", FDM, STRAIGHT)):
-        beta, mu, n_layers, _ = settings[shown.name]
+        half = settings[shown.name].n_layers // 2
         yield Trial(
             "layers",
             label,
-            lambda dim, kind=kind, b=beta, m=mu, half=n_layers // 2: kind(
-                dim, n_layers=half, beta=b, mu=m, steps=STEPS, refined=True
+            lambda dim, kind=kind, half=half: kind(
+                dim, n_layers=half, beta=0.9, mu=0.9, steps=steps_for(half), refined=True
             ),
             [shown],
         )
@@ -279,7 +282,7 @@ def goals(rows: pd.DataFrame, seconds: dict[bool, float]) -> list[Goal]:
     six = rows[rows["family"] == SIX]["share"]
     low = gain[~(gain >= 3)]
     found = [
-        most("spirals: exact DTW from the demonstrated start", first.loc[near.groups, "dtw"], 3),
+        most("spirals: exact DTW from the demonstrated start", first.loc[list(near.groups), "dtw"], 3),
         most("spirals: mean exact DTW over 20 starts", near.mean(), 8),
         most("spirals: largest exact DTW over 20 starts", near.max(), 20),
         Goal(
