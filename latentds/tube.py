@@ -199,7 +199,7 @@ class Candidate(NamedTuple):
         return self._replace(layers=refine(self.layers, self.line, path, 0.95, weights=weights))
 
     def mse(self, path: Array) -> float:
-        psi = LocallyWeightedTranslations(path.shape[1], len(self.layers.widths))
+        psi = LocallyWeightedTranslations(path.shape[1], max(1, len(self.layers.widths)))
         psi.assign(*(torch.from_numpy(part) for part in self.layers))
         with torch.no_grad():
             return float((psi(torch.from_numpy(self.line)) - torch.from_numpy(path)).square().mean())

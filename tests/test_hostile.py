@@ -20,9 +20,9 @@ from latentds.testing import wavy_motion
 
 @seeded(7)
 @settings(
-    max_examples=60, deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck)
+    max_examples=25, deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck)
 )
-@given(cases(largest=400))
+@given(cases(largest=200))
 def test_hostile_demonstrations(case):
     found = outcome(case)
     assert not found.startswith("BROKEN"), f"{case}: {found}"
@@ -33,7 +33,8 @@ PLAIN = Case("FDM", "smooth", "none", "float64", 100, 2, 1.0, 0.0, 0.01, 0)
 
 @pytest.mark.parametrize("method", METHODS)
 def test_harmless_demonstrations_are_fitted(method):
-    for dim in (1, 2, 3):
+    assert outcome(PLAIN._replace(method=method, dim=1, shape="collinear")) == "stable"
+    for dim in (2, 10):
         assert outcome(PLAIN._replace(method=method, dim=dim)) == "stable"
 
 
@@ -144,7 +145,7 @@ def test_gradients_are_finite_far_away_and_at_the_attractor(ds):
 
 @torch.no_grad()
 def test_eight_threads_give_the_serial_result(ds, draw):
-    batches = [torch.randn(n, 3, generator=draw, dtype=torch.float64) for n in (1, 7, 40, 20) * 6]
+    batches = [torch.randn(n, 3, generator=draw, dtype=torch.float64) for n in (1, 7, 20) * 4]
     times = torch.linspace(0, 1, 5)
 
     def evaluate(y):
