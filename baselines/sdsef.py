@@ -163,7 +163,8 @@ class NormalizedDescent(LatentDynamics):
         begin = self._stretch(distance)
         end = begin.detach().clamp(max=0.0) - TAIL
         spread = (begin.detach() - end).nan_to_num(0.0, 4096).flatten()
-        n_cells = int(torch.cat([spread, spread.new_tensor([8.0])]).amax().clamp(max=4096).ceil())
+        # The demonstrated start spreads over a whole number of cells: rounding down or up there would make it jump.
+        n_cells = 1 + int(torch.cat([spread, spread.new_tensor([8.0])]).amax().clamp(max=4096).round())
         step = (begin - end) / n_cells
         nodes = begin.unsqueeze(-1) - step.unsqueeze(-1) * torch.arange(n_cells + 1, dtype=x.dtype, device=x.device)
         radii, growth = self._unstretch(nodes)
