@@ -290,6 +290,7 @@ def _train_tuned(learner: SDSEF, data: _Normalized, generator: torch.Generator |
     plan = PLANS["tuned"]
     stages = STAGES if learner.dim > 2 else 1
     short = plan.epochs // (2 * STAGES)
+    plan = replace(plan, epochs=max(1, plan.epochs - (stages - 1) * short))
     history: list[float] = []
     notes: list[str] = []
     for stage in range(1, stages + 1):
@@ -298,7 +299,7 @@ def _train_tuned(learner: SDSEF, data: _Normalized, generator: torch.Generator |
             _tuned_loss(learner, data.straightened(stage / stages)),
             list(learner.parameters()),
             len(data.points) - len(data.starts),
-            replace(plan, epochs=max(1, short if stage < stages else plan.epochs - (stages - 1) * short)),
+            plan if stage == stages else replace(plan, epochs=max(1, short), warm_up=0.3),
             generator=generator,
             progress=title if progress else False,
         )
