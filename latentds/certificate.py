@@ -226,36 +226,35 @@ class _Search:
     def _equilibria(self) -> Line:
         """Damped Newton steps on f(y)/‖y - y*‖ = 0; dividing takes the attractor itself away from the solver."""
 
-        def slowness(y: Tensor) -> Tensor:
+        def pace(y: Tensor) -> Tensor:
             offset = torch.linalg.vector_norm(y - self.goal, dim=-1, keepdim=True)
-            velocity: Tensor = self.ds(y)
-            slow: Tensor = velocity / offset.clamp(min=1e-9 * self.size) * self.duration
-            return slow
+            paced: Tensor = self.ds(y) / offset.clamp(min=1e-9 * self.size) * self.duration
+            return paced
 
         lengths = torch.tensor([2.0, 1.0, 0.3]).to(self.points).view(-1, 1, 1, 1)  # 2 is right for a double root
         damping = torch.tensor([1e-12, 1e-4, 1e-2, 1.0]).to(self.points).view(-1, 1, 1)
         nudge = 1e-3 * self.tolerance**0.5 * self.size
         nudges = nudge * torch.eye(self.ds.dim).to(self.points)
         with torch.no_grad():
-            y, relative = self.points, torch.linalg.vector_norm(slowness(self.points), dim=-1)
+            y, relative = self.points, torch.linalg.vector_norm(pace(self.points), dim=-1)
             for _ in range(30):
-                ahead, behind = (slowness(y.unsqueeze(-2) + side * nudges) for side in (1, -1))
+                ahead, behind = (pace(y.unsqueeze(-2) + side * nudges) for side in (1, -1))
                 slopes = (ahead - behind).mT.nan_to_num() / (2 * nudge)
                 left, stretch, right = torch.linalg.svd(slopes)
-                along = (left.mT @ slowness(y).nan_to_num().unsqueeze(-1)).squeeze(-1)
+                along = (left.mT @ pace(y).nan_to_num().unsqueeze(-1)).squeeze(-1)
                 damped = along * stretch / (stretch.square() + damping * stretch[:, :1].square()).clamp(min=1e-300)
                 trials = (y - lengths * (damped.unsqueeze(-2) @ right).squeeze(-2)).flatten(0, 1)
                 trials = trials.clamp(self.box[0], self.box[1])
-                left_over = torch.linalg.vector_norm(slowness(trials), dim=-1).nan_to_num(nan=math.inf)
+                left_over = torch.linalg.vector_norm(pace(trials), dim=-1).nan_to_num(nan=math.inf)
                 best = left_over.argmin(0)
                 rows = left_over.amin(0).argsort()[: max(32, len(y) // 2)]  # give up the worse half at every step
                 y = trials[best, torch.arange(len(y))][rows]
             every = torch.cat([self.points, y])
             relative = torch.cat([relative, left_over.amin(0)[rows]])
         away = torch.linalg.vector_norm(every - self.goal, dim=-1) > 1e-4 * self.size
-        claim, detail = "no equilibrium but the attractor", "-least relative speed"
-        # Still moving: the limit is far below any pause that a fit leaves in a motion.
-        return self._judge(claim, -relative[away], -1e-10, detail, every[away])
+        # Still moving: the limit is far beyond any pause that a fit leaves in a motion.
+        durations, claim = 1 / relative[away], "no equilibrium but the attractor"
+        return self._judge(claim, durations, 1e10, "largest slowness", every[away])
 
     def _descent(self) -> Line:
         """Sampling, then gradient ascent on V̇/V from the worst points, by differences."""
