@@ -20,7 +20,7 @@ from latentds.training import Plan, Training, descend
 
 PLANS = {
     "official": Plan(epochs=5000, learning_rate=1e-4, weight_decay=1e-10, clip=0.1, patience=250),
-    "tuned": Plan(epochs=600, learning_rate=1e-3, n_batches=4, warm_up=0.05, clip=1.0, slack=0.3),
+    "tuned": Plan(epochs=710, learning_rate=1e-3, n_batches=4, warm_up=0.05, clip=1.0, slack=0.3),
 }
 STAGES = 8
 """Steps from the chord to the demonstration in the tuned recipe."""
@@ -289,17 +289,20 @@ def _train_tuned(learner: SDSEF, data: _Normalized, generator: torch.Generator |
     """
     plan = PLANS["tuned"]
     stages = STAGES if learner.dim > 2 else 1
-    short = plan.epochs // (2 * STAGES)
-    plan = replace(plan, epochs=max(1, plan.epochs - (stages - 1) * short))
+    short = plan.epochs // 19
     history: list[float] = []
     notes: list[str] = []
     for stage in range(1, stages + 1):
         title = f"stage {stage} of {stages}"
+        if stage == stages:
+            effort = replace(plan, epochs=plan.epochs - (stages + 2) * short if stages > 1 else plan.epochs)
+        else:  # what the first bend leaves unlearned, no later stage has been seen to mend
+            effort = replace(plan, epochs=max(1, 4 * short if stage == 1 else short), warm_up=0.3)
         training = descend(
             _tuned_loss(learner, data.straightened(stage / stages)),
             list(learner.parameters()),
             len(data.points) - len(data.starts),
-            plan if stage == stages else replace(plan, epochs=max(1, short), warm_up=0.3),
+            effort,
             generator=generator,
             progress=title if progress else False,
         )
