@@ -184,7 +184,9 @@ def test_other_processes_give_the_same_result(how, draw):
     if how not in multiprocessing.get_all_start_methods():
         pytest.skip(f"no {how} on {sys.platform}")
     ds, y = TubeDS(3, n_layers=20, refined=False).fit(wavy_motion(3)), torch.randn(300, 3, generator=draw).double()
+    torch.set_num_threads(2)
     torch.randn(2_000_000).exp().sum()  # torch's own threads start
+    torch.set_num_threads(1)
     context = multiprocessing.get_context(how)
     queue = context.Queue()
     with torch.no_grad():
