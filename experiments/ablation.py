@@ -441,7 +441,7 @@ def gains(rows: pd.DataFrame) -> Figure:
         ):
             means = part.groupby("method")["share"].mean().reindex(labels)
             axes.barh(place + shift, means, 0.36, color=colour, label=name)
-        axes.set(xscale="log", title=family, xlabel="DTW/500 [sizes of the motion]")
+        axes.set(xscale="log", xlim=(5e-5, 1), title=family, xlabel="DTW/500 [sizes of the motion]")
         axes.set_yticks(place, labels)
         axes.grid(axis="x", color="#DDDDDD", lw=0.6)
         axes.set_axisbelow(True)
