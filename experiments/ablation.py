@@ -35,6 +35,7 @@ from experiments.spirals import CHEBYSHEV, STABLE, STRAIGHT, spirals
 from latentds import ChebyshevDS, Demonstration, datasets, kernels, metrics, plotting, tube
 from latentds.base import LatentDS
 from latentds.benchmark import Cell, Factory, Protocol, evaluate
+from latentds.matching import PINS
 from latentds.tube import TubeDS
 
 PROTOCOL = Protocol()
@@ -73,17 +74,18 @@ class Trial(NamedTuple):
 def methods(name: str) -> dict[str, tuple[Factory, str]]:
     """{label: (factory, isotopy)} for the motion of that name."""
     found: dict[str, tuple[Factory, str]] = {}
-    for label, kind, settings in (("Chebyshev", ChebyshevDS, CHEBYSHEV), ("FDM", FDM, STRAIGHT)):
-        beta, mu, n_layers, _ = settings.get(name, STABLE)
-        for idea, steps, refined in (
-            ("", 1, False),
-            (" + continuation", steps_for(n_layers), False),
-            (" + refinement", 1, True),
-            (" + both", steps_for(n_layers), True),
+    for label, kind, table in (("Chebyshev", ChebyshevDS, CHEBYSHEV), ("FDM", FDM, STRAIGHT)):
+        beta, mu, n_layers, _ = table.get(name, STABLE)
+        for idea, settings in (
+            (", ends not pinned", {"pinned": False}),
+            ("", {}),
+            (" + continuation", {"steps": steps_for(n_layers)}),
+            (" + refinement", {"refined": True}),
+            (" + both", {"steps": steps_for(n_layers), "refined": True}),
         ):
             found[label + idea] = (
-                lambda dim, kind=kind, b=beta, m=mu, layers=n_layers, steps=steps, refined=refined: kind(
-                    dim, n_layers=layers, beta=b, mu=m, steps=steps, refined=refined
+                lambda dim, kind=kind, beta=beta, mu=mu, layers=n_layers, settings=settings: kind(
+                    dim, n_layers=layers, beta=beta, mu=mu, **settings
                 ),
                 "",
             )
@@ -124,14 +126,14 @@ def trials(quick: bool, recordings: Sequence[Demonstration], handwriting: bool) 
 
 
 def layer_trials(shown: Demonstration) -> Iterator[Trial]:
-    """Half of the paper's layers with continuation and refinement, β and μ as in TubeDS."""
+    """Half of the paper's layers, the pins among them, with continuation and refinement, β and μ as in TubeDS."""
     for label, kind, settings in (("Chebyshev", ChebyshevDS, CHEBYSHEV), ("FDM", FDM, STRAIGHT)):
         half = settings[shown.name].n_layers // 2
         yield Trial(
             "layers",
             label,
             lambda dim, kind=kind, half=half: kind(
-                dim, n_layers=half, beta=0.9, mu=0.9, steps=steps_for(half), refined=True
+                dim, n_layers=half - PINS, beta=0.9, mu=0.9, steps=steps_for(half), refined=True
             ),
             [shown],
         )

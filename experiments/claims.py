@@ -106,22 +106,23 @@ def spectrum(dims: Sequence[int] = DIMS, count: int = PATH) -> pd.DataFrame:
 
 
 class Variant(LatentDS):
-    """ChebyshevDS or FDM with another latent motion, or with the paper's attractor ψ(x_N) for ours, ψ(ψ⁻¹(y*)) = y*.
+    """ChebyshevDS or FDM with another latent motion, or with another attractor.
 
     Args:
         contraction: κ of the decoupled form ṗ = -κp, per duration; None keeps the ray.
-        exact: whether the attractor is the goal.
+        attractor: "pinned", ours; "ψ⁻¹(y*)", exact too but without pins; or the paper's, "ψ(x_N)", off the goal.
     """
 
     def __init__(
-        self, dim: int, kind: type[ChebyshevDS] | type[FDM], setting: Setting, contraction: float | None, exact: bool
+        self, dim: int, kind: type[ChebyshevDS] | type[FDM], setting: Setting, contraction: float | None, attractor: str
     ) -> None:
-        greedy = kind(dim, n_layers=setting.n_layers, beta=setting.beta, mu=setting.mu)
+        pinned = attractor == PINNED
+        greedy = kind(dim, n_layers=setting.n_layers, beta=setting.beta, mu=setting.mu, pinned=pinned)
         pull = PiecewiseLinearLaw(torch.ones(1), torch.ones(1))
         law = PiecewiseLinearLaw.uniform()
         dynamics = greedy.dynamics if contraction is None else TubeDynamics(dim, law, pull)
         super().__init__(dim, greedy.diffeomorphism, dynamics)
-        self.greedy, self.contraction, self.exact = greedy, contraction, exact
+        self.greedy, self.contraction, self.printed = greedy, contraction, attractor == PRINTED
 
     def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> Variant:
         assert isinstance(demonstration, Demonstration)
@@ -136,10 +137,13 @@ class Variant(LatentDS):
             dynamics.pull = PiecewiseLinearLaw(torch.ones(1), rate)
         with torch.no_grad():
             # The latent line runs from the start to the goal themselves, so x_N is the goal.
-            attractor = self.encode(demonstration.goal) if self.exact else demonstration.goal
+            attractor = demonstration.goal if self.printed else self.encode(demonstration.goal)
             dynamics.aim(self.encode(demonstration.start), attractor)
             self.attractor.copy_(self.decode(attractor))
         return self
+
+
+PINNED, PRINTED = "pinned", "ψ(x_N)"
 
 
 class Change(NamedTuple):
@@ -149,7 +153,7 @@ class Change(NamedTuple):
     n_points: int = 1000
     slowest: float = 1e-2
     contraction: float | None = None
-    exact: bool = True
+    attractor: str = PINNED
     stable_only: bool = False
 
 
@@ -162,7 +166,8 @@ CHANGES = (
     Change("stop at speed .001", slowest=1e-3, stable_only=True),
     Change("decoupled, κ = 5", contraction=5.0),
     Change("decoupled, κ = 20", contraction=20.0),
-    Change("attractor ψ(x_N)", exact=False),
+    Change("not pinned, x* = ψ⁻¹(y*)", attractor="ψ⁻¹(y*)"),
+    Change("not pinned, attractor ψ(x_N)", attractor=PRINTED),
 )
 
 
@@ -190,6 +195,6 @@ def sensitivity_cells(settings: dict[str, dict[str, Setting]]) -> list[Cell]:
 def variant_cell(method: str, setting: Setting, change: Change, shown: Demonstration) -> Cell:
     return Cell(
         f"{method} | {change.name}",
-        lambda dim: Variant(dim, KINDS[method], setting, change.contraction, change.exact),
+        lambda dim: Variant(dim, KINDS[method], setting, change.contraction, change.attractor),
         shown,
     )

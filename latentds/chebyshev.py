@@ -9,7 +9,7 @@ from .base import LatentDS
 from .demonstration import Demonstration, only_demonstration
 from .diffeomorphism import LocallyWeightedTranslations
 from .embedding import chebyshev_columns, place
-from .matching import settle
+from .matching import PINS, settle
 from .time_law import ChebyshevLaw, RayDynamics
 
 
@@ -19,7 +19,7 @@ class ChebyshevDS(LatentDS):
     The latent points are the entries of the eigenvectors of the demonstration graph's Laplacian (paper, eq. 25),
     reversed and laid from the demonstrated start to its goal; ψ maps them onto the demonstration by greedy locally
     weighted translations; the latent point moves by the eigenmap's own law. Unlike the paper's, the attractor is
-    exact: x* = ψ⁻¹(y*), where ψ(x_N) misses y* by about √MSE.
+    exact.
 
     Args:
         dim: n >= 1.
@@ -28,6 +28,8 @@ class ChebyshevDS(LatentDS):
         mu: μ in (0, 1), how near to its invertibility bound a layer may come.
         steps: continuation steps of the matching; 1 is the paper's.
         refined: whether all layers are moved together by L-BFGS after the greedy match; the paper's are not.
+        pinned: whether two more layers bring the ends of the latent line exactly onto start and goal. The paper's are
+            off by about √MSE; without pins x* = ψ⁻¹(y*), which can lie far from the end of the line.
     """
 
     def __init__(
@@ -39,18 +41,21 @@ class ChebyshevDS(LatentDS):
         mu: float = 0.9,
         steps: int = 1,
         refined: bool = False,
+        pinned: bool = True,
     ) -> None:
-        super().__init__(dim, LocallyWeightedTranslations(dim, n_layers), RayDynamics(dim, ChebyshevLaw()))
-        self.n_layers = self.diffeomorphism.n_layers
+        self.n_layers = whole_number(n_layers, "n_layers", at_least=1)
+        psi = LocallyWeightedTranslations(dim, self.n_layers + PINS * bool(pinned))
+        super().__init__(dim, psi, RayDynamics(dim, ChebyshevLaw()))
         self.beta = number_in(beta, "beta", 0, 1, ends="(]")
         self.mu = number_in(mu, "mu", 0, 1)
         self.steps = whole_number(steps, "steps", at_least=1)
         self.refined = bool(refined)
+        self.pinned = bool(pinned)
 
     def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> ChebyshevDS:
         shown = only_demonstration(demonstration, self.dim, "ChebyshevDS")
         columns = chebyshev_columns(len(shown), self.dim)[::-1]
         latent = place(columns, shown.start.numpy(), shown.goal.numpy())
         law = ChebyshevLaw(shown.duration)
-        settle(self, latent, shown, law, beta=self.beta, mu=self.mu, steps=self.steps, refined=self.refined)
+        settle(self, latent, shown, law, self.beta, self.mu, self.steps, self.refined, self.pinned)
         return self

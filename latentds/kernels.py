@@ -603,13 +603,14 @@ def _rate(table: Array, s: Any) -> Any:
 def greedy() -> Any:
     """The greedy match of :func:`latentds.matching.match`; moves ``moved`` in place.
 
-    (moved, y: (N, n); β, μ²e/2, largest ρ²; layers (M, 2n+1) to fill with (c, v, ρ²)) -> layers filled. The loss of
-    a layer, ‖v‖² Σ k² - 2 a k with k = exp(-ρ²d) and a = error·v/‖v‖², is evaluated on a grid of ρ² with ratio √2
-    from the bound down to where every k is near 1: doubling ρ² squares k, so the grid costs two exponentials a point.
-    From the best of the grid, Newton's method inside a bracket, with exact exponentials.
+    (moved, y: (N, n); β, μ²e/2, largest ρ²; the point to move, -1 for the one with the largest error; layers
+    (M, 2n+1) to fill with (c, v, ρ²)) -> layers filled. The loss of a layer, ‖v‖² Σ k² - 2 a k with k = exp(-ρ²d) and
+    a = error·v/‖v‖², is evaluated on a grid of ρ² with ratio √2 from the bound down to where every k is near 1:
+    doubling ρ² squares k, so the grid costs two exponentials a point. From the best of the grid, Newton's method
+    inside a bracket, with exact exponentials.
     """
 
-    def greedy(moved: Array, y: Array, beta: float, bound: float, narrowest: float, layers: Array) -> int:
+    def greedy(moved: Array, y: Array, beta: float, bound: float, narrowest: float, at: int, layers: Array) -> int:
         count, dim = moved.shape
         padded = (count + WIDTH - 1) // WIDTH * WIDTH
         x, error = np.zeros(dim * padded), np.zeros(dim * padded)
@@ -626,7 +627,7 @@ def greedy() -> Any:
                 squared = 0.0
                 for e in range(dim):
                     squared += error[e * padded + i] ** 2
-                if squared > largest:
+                if i == at or (at < 0 and squared > largest):
                     worst, largest = i, squared
             size = beta * beta * largest
             if not (size > 0.0 and bound / size < np.inf):
@@ -716,4 +717,5 @@ def greedy() -> Any:
                 moved[i, e] = x[e * padded + i]
         return used
 
-    return compiled(greedy, "int64(float64[:, ::1], float64[:, ::1], float64, float64, float64, float64[:, ::1])")
+    points = "float64[:, ::1]"
+    return compiled(greedy, f"int64({points}, {points}, float64, float64, float64, int64, {points})")

@@ -32,18 +32,18 @@ def match(x: Array, y: Array, n_layers: int, beta: float, mu: float) -> Layers:
 
 
 def advance(
-    moved: Array, y: Array, n_layers: int, beta: float, mu: float, narrowest: float = 0.0
+    moved: Array, y: Array, n_layers: int, beta: float, mu: float, narrowest: float = 0.0, at: int = -1
 ) -> tuple[Layers, Array]:
     """Up to ``n_layers`` greedy layers on points where they stand, and where those layers move them: (N, n).
 
-    No layer is narrower, 1/ρ, than ``narrowest``.
+    No layer is narrower, 1/ρ, than ``narrowest``. Each is laid on the point ``at`` instead of the worst, if given.
     """
     dim = moved.shape[1]
     moved = np.array(moved, dtype=np.float64, order="C")
     rows = np.empty((n_layers, 2 * dim + 1))
     limit = 1 / narrowest**2 if narrowest > 0 else math.inf
     target = np.ascontiguousarray(y, dtype=np.float64)
-    used = kernels.greedy()(moved, target, beta, (mu * WIDTH_BOUND) ** 2, limit, rows)
+    used = kernels.greedy()(moved, target, beta, (mu * WIDTH_BOUND) ** 2, limit, at, rows)
     return Layers(rows[:used, :dim], rows[:used, dim:-1], np.sqrt(rows[:used, -1])), moved
 
 
@@ -64,20 +64,46 @@ def match_along(curves: Array, n_layers: int, beta: float, mu: float, narrowest:
     return Layers(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
+PINS = 2
+"""Layers that :func:`pin_ends` adds."""
+
+
+def pin_ends(layers: Layers, x: Array, y: Array, mu: float) -> Layers:
+    """``layers`` and two more, that bring the first and the last point of x, (N, n), exactly onto those of y.
+
+    Greedy matching leaves both off by about √MSE, and where ψ is badly conditioned ψ⁻¹ of the start and of the goal
+    then lies far from the ends of the latent line. Each pin is as wide as leaves the least squared error over all.
+    """
+    moved, parts = carried(layers, x), [layers]
+    for at in (0, len(x) - 1):
+        pin, moved = advance(moved, y, 1, 1.0, mu, at=at)
+        parts.append(pin)
+    return Layers(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+@torch.no_grad()
+def carried(layers: Layers, x: Array) -> Array:
+    """ψ(x) of these layers, (N, n) -> (N, n)."""
+    psi = LocallyWeightedTranslations(x.shape[1], max(1, len(layers.widths)))
+    psi.assign(*(torch.from_numpy(part) for part in layers))
+    moved: Array = psi(torch.from_numpy(x)).numpy()
+    return moved
+
+
 def settle(
     ds: LatentDS,
     latent: Array,
     shown: Demonstration,
     law: TimeLaw,
-    *,
     beta: float,
     mu: float,
-    steps: int = 1,
-    refined: bool = False,
+    steps: int,
+    refined: bool,
+    pinned: bool,
 ) -> None:
     """Fit ψ so that it maps ``latent`` (N, n) onto the demonstration, and lay the dynamics along it.
 
-    ``steps`` of a straight isotopy; ``refined`` moves all layers together afterwards.
+    ``steps`` of a straight isotopy; ``refined`` moves all layers together afterwards; ``pinned`` adds the pins.
     """
     began = time.perf_counter()
     psi, dynamics = ds.diffeomorphism, ds.dynamics
@@ -85,9 +111,11 @@ def settle(
     assert isinstance(dynamics, RayDynamics)
     points = shown.positions.numpy()
     with fitting(ds, shown):
-        layers = match_along(straight_isotopy(latent, points, steps), psi.n_layers, beta, mu)
+        layers = match_along(straight_isotopy(latent, points, steps), psi.n_layers - PINS * pinned, beta, mu)
         if refined:
             layers = refine(layers, latent, points, mu)
+        if pinned:
+            layers = pin_ends(layers, latent, points, mu)
         psi.assign(*(torch.from_numpy(part) for part in layers))
         dynamics.law = law.to(ds.attractor)
         with torch.no_grad():

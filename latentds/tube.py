@@ -19,7 +19,7 @@ from .demonstration import Demonstration, demonstrations_of
 from .diffeomorphism import Layers, LocallyWeightedTranslations
 from .embedding import arc_length_path, place, straight_column
 from .isotopy import straight_isotopy, unbending_isotopy
-from .matching import fitting, match_along
+from .matching import carried, fitting, match_along
 from .metrics import dtw
 from .refinement import refine
 from .time_law import PiecewiseLinearLaw, TubeDynamics
@@ -30,6 +30,8 @@ N_POINTS = 600
 """Points, even in arc length, that ψ is matched on."""
 NARROWEST = 3.0
 """Least width 1/ρ of a greedy layer, in distances between those points: a narrower one fits a point with a spike."""
+DECIMALS = 9
+"""To which the motion is rounded, in its own sizes."""
 TUBE = 0.02
 """Radius of the tube that the report speaks of, in lengths of the latent line."""
 NEAR = 0.05
@@ -94,25 +96,28 @@ class TubeDS(LatentDS):
         began = time.perf_counter()
         every = demonstrations_of(demonstration, self.dim)
         shown, spread = mean_motion(every)
-        path, way, times = arc_length_path(shown.positions.numpy(), shown.times.numpy(), N_POINTS)
+        # L-BFGS runs on to another match from another rounding, so that none may come from the units or the origin.
+        origin, unit = shown.goal.numpy(), shown.size
+        shape = Demonstration(((shown.positions - shown.goal) / unit).round(decimals=DECIMALS), shown.dt)
+        path, way, times = arc_length_path(shape.positions.numpy(), shape.times.numpy(), N_POINTS)
         _refuse_crossings(path)
         with fitting(self, shown):
             law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
             judged = []
             for candidate in _candidates(path, self.psi.n_layers):
-                self._lay(candidate, shown, law)
-                judged.append((self._score(shown), candidate))
+                self._lay(candidate, shape, law)
+                judged.append((self._score(shape), candidate))
             judged.sort(key=lambda pair: pair[0])
             if self.refined:
                 for tried, (_, candidate) in enumerate(list(judged)):
                     if tried and min(score for score, _ in judged) < (ENOUGH if tried < 3 else 3 * ENOUGH):
                         break
                     better = candidate.refined(path)
-                    self._lay(better, shown, law)
-                    judged.append((self._score(shown), better))
-            best = min(judged, key=lambda pair: pair[0])[1]
+                    self._lay(better, shape, law)
+                    judged.append((self._score(shape), better))
+            best = min(judged, key=lambda pair: pair[0])[1].placed(origin, unit)
             self._lay(best, shown, law)
-            report = self._report(best, path, shown, spread, began)
+            report = self._report(best, origin + unit * path, shown, spread, began)
             self.fit_report = replace(report, learned_from=tuple(one.fingerprint for one in every))
         return self
 
@@ -198,11 +203,14 @@ class Candidate(NamedTuple):
         weights[[0, -1]] = 0.05 * len(path)  # the start must encode to the start, the goal to the goal
         return self._replace(layers=refine(self.layers, self.line, path, 0.95, weights=weights))
 
+    def placed(self, origin: Array, unit: float) -> Candidate:
+        """The same match in other units, about another origin."""
+        centers, directions, widths = self.layers
+        layers = Layers(origin + unit * centers, unit * directions, widths / unit)
+        return self._replace(layers=layers, line=origin + unit * self.line)
+
     def mse(self, path: Array) -> float:
-        psi = LocallyWeightedTranslations(path.shape[1], max(1, len(self.layers.widths)))
-        psi.assign(*(torch.from_numpy(part) for part in self.layers))
-        with torch.no_grad():
-            return float((psi(torch.from_numpy(self.line)) - torch.from_numpy(path)).square().mean())
+        return float(np.square(carried(self.layers, self.line) - path).mean())
 
 
 def _candidates(path: Array, n_layers: int) -> Iterator[Candidate]:

@@ -12,6 +12,7 @@ from baselines import FDM
 from latentds import ChebyshevDS, Demonstration, StableDS, datasets, metrics
 from latentds.base import FitReport
 from latentds.benchmark import COLUMNS, Cell, Protocol, compare, run
+from latentds.matching import PINS
 
 SPIRAL = datasets.unstable_spiral(1, 60)
 TIMES = ["fit_seconds", "rollout_seconds"]
@@ -100,7 +101,7 @@ def test_scores_are_those_of_the_rollouts():
         assert row["dtw_per_point"] == row["dtw"] / 50
         assert row["endpoint_error"] == pytest.approx(metrics.endpoint_error(path, shown), abs=1e-6)
         assert row["mse"] == pytest.approx(ds.fit_report.mse)
-        assert row["n_layers"] == 8
+        assert row["n_layers"] == 8 + PINS
         assert row["n_parameters"] == sum(p.numel() for p in ds.parameters())
         assert np.allclose(outcome.paths[row["start"]], path, atol=1e-9)
 
@@ -191,7 +192,7 @@ def test_settings_may_change_with_the_demonstration():
         Cell("FDM", lambda dim, m=m: FDM(dim, n_layers=m), datasets.unstable_spiral(c, 60)) for c, m in ((1, 4), (3, 6))
     ]
     layers = {o.demonstration: o.rows[0]["n_layers"] for o in run(cells, Protocol(n_starts=0, n_points=20), n_jobs=1)}
-    assert layers == {"unstable c=1": 4, "unstable c=3": 6}
+    assert layers == {"unstable c=1": 4 + PINS, "unstable c=3": 6 + PINS}
 
 
 def test_a_dimension_of_seven_and_an_unnamed_demonstration():

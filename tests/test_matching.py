@@ -13,7 +13,7 @@ from baselines import FDM
 from latentds import ChebyshevDS, Demonstration, TubeDS, datasets
 from latentds.diffeomorphism import WIDTH_BOUND
 from latentds.embedding import chebyshev_columns, place, straight_column
-from latentds.matching import match
+from latentds.matching import PINS, match, pin_ends
 from latentds.testing import wavy_motion
 
 # Table I of the paper: complexity -> (beta, mu, layers, MSE per coordinate).
@@ -105,7 +105,7 @@ def test_table_1(method, c):
     shown = datasets.unstable_spiral(c)
     ds = method(3, n_layers=n_layers, beta=beta, mu=mu).fit(shown)
     assert ds.fit_report.mse < 3 * reported
-    assert ds.fit_report.n_layers == n_layers
+    assert ds.fit_report.n_layers == n_layers + PINS
     latent = chebyshev_columns(1000, 3)[::-1] if method is ChebyshevDS else straight_column(1000)
     with torch.no_grad():
         mapped = ds.decode(torch.from_numpy(place(latent, shown.start.numpy(), shown.goal.numpy())))
@@ -124,19 +124,24 @@ def test_attractor_is_the_end_of_the_demonstration(method, dim):
         assert (ds.decode(ds.dynamics.attractor) - shown.goal).abs().max() < 1e-9
 
 
-@pytest.mark.parametrize(
-    "method",
-    [
-        FDM,
-        pytest.param(
-            ChebyshevDS,
-            marks=pytest.mark.xfail(
-                strict=True,
-                reason="ψ is so badly conditioned at the goal that ψ⁻¹(y*) lies .6 from the latent line's end",
-            ),
-        ),
-    ],
-)
+@pytest.mark.parametrize("c", [7, 15])
+@pytest.mark.parametrize("method", TABLE_I, ids=lambda method: method.__name__)
+def test_the_ends_are_pinned(method, c):
+    """Without, ψ⁻¹ of the start and the goal lie up to the size of the motion from the ends of the latent line."""
+    beta, mu, n_layers, _ = TABLE_I[method][c]
+    shown = datasets.unstable_spiral(c)
+    ds = method(3, n_layers=n_layers, beta=beta, mu=mu).fit(shown)
+    for end in (shown.start, shown.goal):
+        with torch.no_grad():
+            torch.testing.assert_close(ds.encode(end), end, rtol=0, atol=1e-6)
+
+
+def test_pins_leave_a_perfect_match_alone():
+    y = wavy_motion(2).positions.numpy()
+    assert len(pin_ends(match(y, y, 10, 0.5, 0.9), y, y, 0.9).widths) == 0
+
+
+@pytest.mark.parametrize("method", TABLE_I, ids=lambda method: method.__name__)
 def test_a_coordinate_at_rest_works(method):
     """Start and goal coincide in it, or it never moves at all."""
     t = torch.linspace(0, 1, 100, dtype=torch.float64)

@@ -33,7 +33,7 @@ def test_the_rule_takes_the_fewest_layers_then_the_least_beta_or_the_least_mse()
 def test_a_match_begins_with_every_shorter_one(method, kind):
     shown = datasets.unstable_spiral(3, 200)
     for count, error in zip((7, 20), tuning.trace(method, shown, 0.5, 0.8, (7, 20)), strict=True):
-        fitted = kind(3, n_layers=count, beta=0.5, mu=0.8).fit(shown)
+        fitted = kind(3, n_layers=count, beta=0.5, mu=0.8, pinned=False).fit(shown)
         assert error == pytest.approx(fitted.fit_report.mse, rel=1e-6)
 
 
@@ -90,15 +90,16 @@ def test_variants_differ_from_the_method_in_one_thing(method):
     plain = claims.KINDS[method](3, n_layers=40, beta=0.5, mu=0.9).fit(shown)
     times = shown.times
     same, decoupled, off = (
-        claims.Variant(3, claims.KINDS[method], setting, kappa, exact).fit(shown)
-        for kappa, exact in ((None, True), (5.0, True), (None, False))
+        claims.Variant(3, claims.KINDS[method], setting, kappa, attractor).fit(shown)
+        for kappa, attractor in ((None, claims.PINNED), (5.0, claims.PINNED), (None, claims.PRINTED))
     )
     path = plain.rollout(shown.start, times)
     torch.testing.assert_close(same.rollout(shown.start, times), path)
     torch.testing.assert_close(decoupled.rollout(shown.start, times), path)  # which is on the axis
     aside = shown.start + 0.1
     assert (decoupled.rollout(aside, times) - plain.rollout(aside, times)).abs().max() > 1e-3
-    torch.testing.assert_close(off.attractor, plain.decode(shown.goal))
+    bare = claims.KINDS[method](3, n_layers=40, beta=0.5, mu=0.9, pinned=False).fit(shown)
+    torch.testing.assert_close(off.attractor, bare.decode(shown.goal))
     assert (off.attractor - shown.goal).norm() > 1e-9
     torch.testing.assert_close(off.rollout(shown.start, 20 * times)[-1], off.attractor, atol=1e-6, rtol=0)
 
