@@ -228,7 +228,7 @@ def _tuned_table(study: Study) -> str:
     rows = study.rows()
     near = rows[rows["start"] > 0]
     means = near.groupby(["demonstration", "method"])["dtw"].agg(lambda s: s.mean(skipna=False))
-    labels = [f"{method}{which}" for method in RIVALS for which in ("", " | least β", " | least MSE")]
+    labels = [f"{method}{which}" for method in RIVALS for which in ("", ", least β", ", least MSE")]
     lines = [[s.name, *(f"{means[s.name, label]:.2f}" for label in labels)] for s in study.spirals]
     return (
         "### The same with hyperparameters by the paper's rule\n\n"

@@ -148,8 +148,8 @@ class Study:
                     chosen = self.choice(method, shown)
                     for label, setting in {
                         method: self.setting(method, shown),
-                        f"{method} | least β": setting_of(chosen.least_beta),
-                        f"{method} | least MSE": setting_of(chosen.least_mse),
+                        f"{method}, least β": setting_of(chosen.least_beta),
+                        f"{method}, least MSE": setting_of(chosen.least_mse),
                     }.items():
                         cells.append(greedy_cell(label, method, setting, shown))
             self._main = self.run(cells, Protocol())
