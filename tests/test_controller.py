@@ -23,7 +23,7 @@ class Tube(LatentDS):
         super().__init__(dim, LocallyWeightedTranslations(dim, 30), TubeDynamics(dim, along, ChebyshevLaw(0.2)))
 
     def fit(self, demonstration, *, progress=False):
-        donor = ChebyshevDS(self.dim, n_layers=30).fit(demonstration)
+        donor = ChebyshevDS(self.dim, n_layers=30, pinned=False).fit(demonstration)
         self.diffeomorphism.load_state_dict(donor.diffeomorphism.state_dict())
         self.attractor.copy_(demonstration.goal)
         self.dynamics.aim(donor.encode(demonstration.start), donor.encode(demonstration.goal))
