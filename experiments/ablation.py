@@ -4,7 +4,8 @@
 
 LASA needs ``make lasa`` once and is left out without it. A recording is any file that ``Demonstration.load`` reads; a
 folder gives all its .npz and .csv files; without any, three made-up arm motions stand in. Leaves rows.csv, summary.md,
-settings.json and pictures in ``--out``.
+settings.json and pictures in ``--out``; finished trials stay in cells.sqlite there, so that the same command goes on
+where it was interrupted.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from latentds import ChebyshevDS, Demonstration, datasets, kernels, metrics, plo
 from latentds.base import LatentDS
 from latentds.benchmark import Cell, Factory, Protocol, evaluate
 from latentds.matching import PINS
+from latentds.store import CellStore, fingerprint
 from latentds.tube import TubeDS
 
 PROTOCOL = Protocol()
@@ -152,6 +154,29 @@ def load(paths: Sequence[Path]) -> list[Demonstration]:
 # --- one trial --------------------------------------------------------------------------------------------------------
 
 
+def results(todo: Sequence[Trial], jobs: int, path: Path) -> Iterator[tuple[Sequence[dict[str, Any]], np.ndarray]]:
+    """What came of each trial, in order; finished ones from the file that an earlier run left."""
+    with CellStore(path) as store:
+        keys, known = [_key(trial) for trial in todo], store.keys()
+        missing = [trial for trial, key in zip(todo, keys, strict=True) if key not in known]
+        work = (joblib.delayed(attempt)(trial) for trial in missing)
+        spread = joblib.Parallel(n_jobs=jobs, return_as="generator", batch_size=1)(work)
+        for key in keys:
+            found = store.get(key) if key in known else next(spread)
+            assert found is not None
+            rows, paths = found
+            if key not in known and not rows[0]["error"]:
+                store.put(key, tuple(rows), paths)
+            yield rows, paths
+
+
+def _key(trial: Trial) -> str:
+    motions = [(d.positions, d.dt, d.name) for d in (*trial.shown, *trial.tests)]
+    made = trial.factory(trial.shown[0].dim)
+    scoring = (attempt, from_other_starts, costs, PROTOCOL, NEAR)
+    return fingerprint(trial.family, trial.method, trial.isotopy, made, len(trial.shown), motions, scoring)
+
+
 def attempt(trial: Trial) -> tuple[list[dict[str, Any]], np.ndarray]:
     """A row per start, and the rollouts (starts, 500, n)."""
     made: list[LatentDS] = []
@@ -168,7 +193,7 @@ def attempt(trial: Trial) -> tuple[list[dict[str, Any]], np.ndarray]:
             protocol = PROTOCOL if trial.family != "recordings" else Protocol(n_starts=6, radius=NEAR * shown.size)
             outcome = evaluate(Cell(trial.method, factory, shown), protocol)
             rows, paths = [dict(row) for row in outcome.rows], outcome.paths
-    common = {"family": trial.family, "dim": shown.dim, "size": shown.size} | costs(made[-1], shown)
+    common = {"family": trial.family, "seed": 0, "dim": shown.dim, "size": shown.size} | costs(made[-1], shown)
     kept = ("method", "demonstration", "start", "status", "error", "dtw", "mse", "n_layers", "fit_seconds")
     per_size = PROTOCOL.n_points * shown.size
     return [{k: row[k] for k in kept} | common | {"share": row["dtw"] / per_size} for row in rows], paths
@@ -494,17 +519,21 @@ def main(
         console.print("LASA handwriting is not installed and left out: run `make lasa` once.")
     kernels.warmup([2, 3, 7])
     todo = list(trials(quick, recordings, handwriting))
-    spread = joblib.Parallel(n_jobs=jobs, return_as="generator", batch_size=1)(joblib.delayed(attempt)(t) for t in todo)
+    out.mkdir(parents=True, exist_ok=True)
+    spread = results(todo, jobs, out / "cells.sqlite")
     found, shapes = [], {}
-    for trial, (rows, paths) in track(zip(todo, spread, strict=True), "fitting …", len(todo), console=console):
-        found += rows
-        if trial.family == LASA and trial.method == "TubeDS":
-            shapes[trial.shown[0].name] = (trial.tests, paths)
+    try:
+        for trial, (rows, paths) in track(zip(todo, spread, strict=True), "fitting …", len(todo), console=console):
+            found += rows
+            if trial.family == LASA and trial.method == "TubeDS":
+                shapes[trial.shown[0].name] = (trial.tests, paths)
+    except KeyboardInterrupt:
+        console.print("Interrupted; the same command goes on from here.")
+        raise typer.Exit(130) from None
     rows = pd.DataFrame(found)
     floors = {shown.name: sampling_floor(shown) for shown in spirals(quick)}
     summary = summarize(rows, floors, {refined: fit_seconds(refined) for refined in (False, True)})
     took = time.perf_counter() - began
-    out.mkdir(parents=True, exist_ok=True)
     settings = {"command": {"quick": quick, "jobs": jobs, "recordings": len(recordings), "seconds": round(took, 1)}}
     settings |= {"protocol": asdict(PROTOCOL), "environment": report.environment()}
     report.write(out / "rows.csv", rows.to_csv(index=False))

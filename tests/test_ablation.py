@@ -8,6 +8,7 @@ import pytest
 
 from experiments import ablation
 from latentds import Demonstration, TubeDS
+from latentds.store import CellStore
 from latentds.testing import wavy_motion
 
 
@@ -54,6 +55,23 @@ def test_a_trial_that_fails_says_so():
     assert rows[0]["status"] == "failed"
     assert "does not meet itself" in rows[0]["error"]
     assert np.isnan(rows[0]["share"])
+
+
+def test_a_rerun_goes_on_where_it_stopped(tmp_path):
+    shown, file = wavy_motion(2), tmp_path / "cells.sqlite"
+    few, more = (
+        ablation.Trial("recordings", f"TubeDS {n}", lambda dim, n=n: TubeDS(dim, n_layers=n, refined=False), [shown])
+        for n in (10, 20)
+    )
+    several = ablation.Trial(ablation.SIX, "TubeDS", few.factory, [shown, shown], [shown])
+    (first,) = ablation.results([few], 1, file)
+    again = list(ablation.results([more, few, several], 1, file))
+    assert again[1][0] == tuple(first[0])  # fit seconds and all
+    np.testing.assert_array_equal(again[1][1], first[1])
+    assert [rows[0]["method"] for rows, _ in again] == ["TubeDS 20", "TubeDS 10", "TubeDS"]
+    assert [len(rows) for rows, _ in again] == [7, 7, 1]
+    with CellStore(file) as store:
+        assert len(store) == 3
 
 
 def test_recordings_are_read_from_files_and_folders(tmp_path):
