@@ -150,6 +150,8 @@ def summarize(rows: pd.DataFrame, spirals: list[str], labels: list[str]) -> str:
         parts += [f"## {title}: exact DTW over the perturbed starts, mean ± sd", _scores(near, "dtw", names, labels)]
         parts += [f"## {title}: FastDTW (radius 1), as in the paper", _scores(near, "dtw_fast", names, labels)]
         parts += [f"## {title}: exact DTW from the demonstrated start", _scores(demonstrated, "dtw", names, labels)]
+        if demonstrated["seed"].nunique() > 1:
+            parts += [f"## {title}: the same, seed by seed", _by_seed(demonstrated, names)]
     parts.append(NOTES)
     if known := [name for name in spirals if name in CHEBYSHEV]:
         parts += ["## Fit: mean squared error per coordinate beside the paper's Table I", _table_one(rows, known)]
@@ -181,6 +183,15 @@ def _scores(rows: pd.DataFrame, score: str, names: list[str], labels: list[str])
             line.append(text + (" †" if abs(fast - exact) > 0.05 * exact else ""))
         lines.append(line + ([_p_values(*(starts[rival] for rival in RIVALS))] if tested else []))
     return report.table(["spiral", *labels, *(["p paired / Welch"] if tested else [])], lines)
+
+
+def _by_seed(rows: pd.DataFrame, names: list[str]) -> str:
+    """The methods that a seed changes."""
+    rows = rows[rows["demonstration"].isin(names)]
+    found = rows.pivot_table(index=["demonstration", "method"], columns="seed", values="dtw", sort=False)
+    found = found[found.max(axis=1) > found.min(axis=1) * (1 + 1e-9)]
+    lines = [[*key, *("—" if np.isnan(one) else f"{one:.2f}" for one in scores)] for key, *scores in found.itertuples()]
+    return report.table(["spiral", "method", *(f"seed {seed}" for seed in found.columns)], lines)
 
 
 def _p_values(first: pd.Series, second: pd.Series) -> str:

@@ -50,6 +50,15 @@ def test_p_values_are_paired_and_welchs():
     assert float(paired) < 0.001 < 0.5 < float(welch)  # a small, steady difference under a large shared spread
 
 
+def test_seeds_stand_side_by_side_for_the_methods_that_they_change():
+    first = made_up(lambda m, d, s: 10.0 + s).assign(seed=0)
+    second = first.assign(seed=1, dtw=first["dtw"] + (first["method"] == "FDM"))
+    summary = summary_of(pd.concat([first, second]))
+    assert line(summary, "seed by seed", "unstable c=7") == "| unstable c=7 | FDM | 10.00 | 11.00 |"
+    assert "| unstable c=7 | Chebyshev |" not in summary.split("seed by seed")[1]
+    assert "seed by seed" not in summary_of(first)
+
+
 @pytest.mark.filterwarnings("ignore:Precision loss")  # made-up scores differ by a constant
 def test_fast_dtw_that_differs_is_marked():
     rows = made_up(lambda m, d, s: 10.0 + 1e-3 * s)
