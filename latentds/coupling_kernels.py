@@ -106,6 +106,11 @@ def _compiled(function: Callable[..., Any]) -> Any:
         return numba.njit(fastmath=True, nogil=True)(function)
 
 
+# Inlined in any case: of a function that is called, each kernel brings its own copy, rounded in its own way, and which
+# one a process ends up with would depend on what it found compiled on disk.
+_inlined = numba.njit(fastmath=True, nogil=True, forceinline=True)
+
+
 # Coordinate i of the part that layer l reads is 2 i + l % 2; of the part that it moves, 2 i + 1 - l % 2. Rows are
 # sliced before they are looped over: an index known to be positive is what lets the compiler vectorise the loop.
 
@@ -238,7 +243,7 @@ def _push_backward(
                         flow[2 * k + part] -= flow[q] * slope[j, layer, i, k]
 
 
-@_compiled
+@_inlined
 def _waves(W: Array, phases: Array, p: Array, at: int, cosines: Array, sines: Array) -> None:
     """cos and sin of W p + b, to 1e-6 while the angles stay below 1e4."""
     n_features = len(phases)
@@ -249,7 +254,7 @@ def _waves(W: Array, phases: Array, p: Array, at: int, cosines: Array, sines: Ar
     _turn(cosines, sines)
 
 
-@_compiled
+@_inlined
 def _turn(angles: Array, sines: Array) -> None:
     """``angles`` x into cos x, and sin x: x = k π + r, and Taylor series in r."""
     for f in range(len(angles)):
@@ -266,7 +271,7 @@ def _turn(angles: Array, sines: Array) -> None:
         angles[f] = sign * cosine
 
 
-@_compiled
+@_inlined
 def _scatter(
     to_row: Array, to_angles: Array, row: Array, whole: float, mixed: Array, cosines: Array, sines: Array
 ) -> None:
@@ -275,19 +280,19 @@ def _scatter(
         to_angles[f] -= row[f] * (whole * sines[f] + mixed[f] * cosines[f])
 
 
-@_compiled
+@_inlined
 def _clear(row: Array) -> None:
     for f in range(len(row)):
         row[f] = F32(0)
 
 
-@_compiled
+@_inlined
 def _add(target: Array, factor: float, row: Array) -> None:
     for f in range(len(target)):
         target[f] += factor * row[f]
 
 
-@_compiled
+@_inlined
 def _dot(one: Array, other: Array) -> Any:
     total = F32(0)
     for f in range(len(one)):
@@ -295,7 +300,7 @@ def _dot(one: Array, other: Array) -> Any:
     return total
 
 
-@_compiled
+@_inlined
 def _dot3(one: Array, other: Array, third: Array) -> Any:
     total = F32(0)
     for f in range(len(one)):

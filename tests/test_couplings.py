@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import copy
+import os
 import pickle
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -136,3 +139,29 @@ def test_bad_arguments_are_named(argument, value):
     given = {"dim": 3, "n_layers": 2, "n_features": 5, argument: value}
     with pytest.raises(ValueError, match=f"^{argument}: expected"):
         AffineCouplings(**given)
+
+
+GRADIENT = """
+import torch
+from latentds.coupling_kernels import Couplings
+
+draw = torch.Generator().manual_seed(0)
+sizes = [(2, 1), (1, 2)] * 2
+frequencies = [torch.randn(2, 60, read, generator=draw) for read, _ in sizes]
+phases = [torch.rand(2, 60, generator=draw) for _ in sizes]
+amplitudes = [(0.05 * torch.randn(2, moved, 60, generator=draw)).requires_grad_() for _, moved in sizes]
+x, push = Couplings(frequencies, phases).linearize(torch.randn(50, 3, generator=draw), amplitudes)
+(x.sum() + push(torch.ones(50, 3)).square().sum()).backward()
+print([part.grad.numpy().tobytes().hex() for part in amplitudes])
+"""
+
+
+def test_kernels_just_compiled_and_kernels_from_disk_round_alike(tmp_path):
+    """A fit is repeated to the bit in the next process, too."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-c", GRADIENT]
+    first, second = (
+        subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout for _ in range(2)
+    )
+    assert len(first) > 1000
+    assert first == second
