@@ -68,6 +68,12 @@ def point_array(values: Any, name: str) -> np.ndarray:
     return np.ascontiguousarray(array)
 
 
+def points_of(dim: int, points: Tensor, name: str) -> None:
+    """Refuse what is not shaped (..., dim)."""
+    if points.ndim == 0 or points.shape[-1] != dim:
+        raise ValueError(f"{name}: expected shape (..., {dim}), got {tuple(points.shape)}")
+
+
 def positive(value: Any, name: str) -> float:
     try:
         number = float(value)

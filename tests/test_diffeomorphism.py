@@ -10,7 +10,7 @@ import torch
 from scipy.optimize import brentq
 
 from latentds import LocallyWeightedTranslations
-from latentds.diffeomorphism import WIDTH_BOUND
+from latentds.diffeomorphism import WIDTH_BOUND, AffineCouplings
 
 
 def random_psi(dim, n_layers=12, strength=1.0, seed=3):
@@ -202,3 +202,13 @@ def test_bad_sizes(value):
         LocallyWeightedTranslations(value, 5)
     with pytest.raises(ValueError, match="n_layers: expected a whole number >= 1"):
         LocallyWeightedTranslations(2, value)
+
+
+@pytest.mark.parametrize("psi", [LocallyWeightedTranslations(3, 5), AffineCouplings(3, 2, 10)], ids=["LWT", "AC"])
+@pytest.mark.parametrize("call", ["forward", "inverse", "linearize", "jacobian", "log_abs_det_jacobian"])
+@pytest.mark.parametrize("shape", [(4, 2), (4, 1), (4,), (3, 4), ()])
+@pytest.mark.parametrize("traced", [False, True])
+def test_points_of_another_dimension_are_refused(psi, call, shape, traced):
+    points = torch.zeros(shape, dtype=torch.float64, requires_grad=traced)
+    with pytest.raises(ValueError, match=r"[xy]: expected shape \(\.\.\., 3\), got "), torch.set_grad_enabled(traced):
+        getattr(psi, call)(points)
