@@ -38,6 +38,8 @@ NEAR = 0.05
 """Distance from the demonstrated start, in sizes of the motion, of the starts that a match is also judged by."""
 ENOUGH = 0.06
 """Score below which no further match is refined; three times as much will do after three."""
+STIFF = 100.0
+"""cond(J) along the path above which a match is judged by all of it, below by its root."""
 FAR = 0.25
 """Distance from the axis, in sizes of the motion, beyond which the inward pull stops growing."""
 
@@ -142,7 +144,7 @@ class TubeDS(LatentDS):
 
     @torch.no_grad()
     def _score(self, shown: Demonstration) -> float:
-        """How badly it rolls out from the demonstrated start (thrice) and NEAR it, times the root of cond(J)."""
+        """How badly it rolls out from the demonstrated start (thrice) and NEAR it, times √cond(J), or more."""
         rows = np.linspace(0, len(shown) - 1, 200).round().astype(int)
         motion = shown.positions[rows]
         offsets = NEAR * shown.size * torch.eye(self.dim, dtype=motion.dtype)
@@ -151,7 +153,8 @@ class TubeDS(LatentDS):
         if not bool(torch.isfinite(paths).all()):
             return math.inf
         misses = [dtw(path, motion) / len(rows) / shown.size for path in paths]
-        return (3 * misses[0] + float(np.mean(misses[1:]))) * math.sqrt(self._condition(self._line()))
+        condition = self._condition(self._line())
+        return (3 * misses[0] + float(np.mean(misses[1:]))) * math.sqrt(condition) * max(1.0, condition / STIFF)
 
     def _line(self, n_points: int = 150) -> Tensor:
         """Latent points from the encoded start to x*, (n_points, n)."""
