@@ -105,6 +105,10 @@ def spectrum(dims: Sequence[int] = DIMS, count: int = PATH) -> pd.DataFrame:
 # --- what the paper leaves open ---------------------------------------------------------------------------------------
 
 
+PINNED, PRINTED = "pinned", "ψ(x_N)"
+"""Attractors of a :class:`Variant`: ours and the paper's."""
+
+
 class Variant(LatentDS):
     """ChebyshevDS or FDM with another latent motion, or with another attractor.
 
@@ -141,9 +145,6 @@ class Variant(LatentDS):
             dynamics.aim(self.encode(demonstration.start), attractor)
             self.attractor.copy_(self.decode(attractor))
         return self
-
-
-PINNED, PRINTED = "pinned", "ψ(x_N)"
 
 
 class Change(NamedTuple):

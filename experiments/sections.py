@@ -384,7 +384,8 @@ def joints(study: Study, found: Report, data: Path | None) -> None:
         "not reproducible: its recordings are not public",
     )
     for shown in {d.name: d for d in (motions[0], max(motions, key=lambda d: scores[d.name]))}.values():
-        paths = {o.method: o.paths for o in outcomes if o.demonstration == shown.name}
+        of = {o.method: o.paths for o in outcomes if o.demonstration == shown.name}
+        paths = {method: of[method] for method in RIVALS}
         found.show(
             f"joints_{shown.name.replace(' ', '_')}", plotting.joints(shown, paths), f"{shown.name}: joints over time"
         )

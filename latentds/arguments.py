@@ -68,7 +68,7 @@ def point_array(values: Any, name: str) -> np.ndarray:
     return np.ascontiguousarray(array)
 
 
-def points_of(dim: int, points: Tensor, name: str) -> None:
+def check_points(dim: int, points: Tensor, name: str) -> None:
     """Refuse what is not shaped (..., dim)."""
     if points.ndim == 0 or points.shape[-1] != dim:
         raise ValueError(f"{name}: expected shape (..., {dim}), got {tuple(points.shape)}")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import torch
 from torch import Tensor, nn
 
-from .arguments import points_of, real_tensor, whole_number
+from .arguments import check_points, real_tensor, whole_number
 from .demonstration import Demonstration
 from .diffeomorphism import Diffeomorphism
 from .time_law import LatentDynamics
@@ -106,7 +106,7 @@ class StableDS(nn.Module, ABC):
     def _points(self, y: Any, name: str = "y") -> tuple[Tensor, torch.dtype]:
         """``y`` in the module's dtype, and the dtype in which the caller wants the answer."""
         points = real_tensor(y, name)
-        points_of(self.dim, points, name)
+        check_points(self.dim, points, name)
         dtype = self.attractor.dtype
         wanted = points.dtype if points.is_floating_point() else dtype
         return (points if points.dtype == dtype else points.to(dtype)), wanted

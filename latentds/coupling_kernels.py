@@ -15,6 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .kernels import cached
+
 F32 = np.float32
 Array = Any
 """A float32 array in compiled code."""
@@ -99,12 +101,7 @@ class _Push(torch.autograd.Function):
         return results
 
 
-def _compiled(function: Callable[..., Any]) -> Any:
-    try:
-        return numba.njit(fastmath=True, nogil=True, cache=True)(function)
-    except RuntimeError:  # no directory to cache in can be written
-        return numba.njit(fastmath=True, nogil=True)(function)
-
+_compiled = cached(fastmath=True, nogil=True)
 
 # Inlined in any case: of a function that is called, each kernel brings its own copy, rounded in its own way, and which
 # one a process ends up with would depend on what it found compiled on disk.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from . import kernels
-from .arguments import points_of, positive, whole_number
+from .arguments import check_points, positive, whole_number
 from .coupling_kernels import Couplings
 
 WIDTH_BOUND = math.sqrt(math.e / 2)
@@ -132,7 +132,7 @@ class LocallyWeightedTranslations(Diffeomorphism):
         self.log_widths[used:] = self.log_widths[:used].mean() if used else 0.0
 
     def forward(self, x: Tensor) -> Tensor:
-        points_of(self.dim, x, "x")
+        check_points(self.dim, x, "x")
         if kernels.serves(self, x):
             return kernels.forward(self, x)
         for c, v, q in self._layers():
@@ -140,7 +140,7 @@ class LocallyWeightedTranslations(Diffeomorphism):
         return x
 
     def inverse(self, y: Tensor) -> Tensor:
-        points_of(self.dim, y, "y")
+        check_points(self.dim, y, "y")
         if kernels.serves(self, y):
             return kernels.inverse(self, y)
         for c, v, q in reversed(self._layers()):
@@ -148,7 +148,7 @@ class LocallyWeightedTranslations(Diffeomorphism):
         return y
 
     def linearize(self, y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-        points_of(self.dim, y, "y")
+        check_points(self.dim, y, "y")
         if kernels.serves(self, y):
             return kernels.linearize(self, y)
         steps = []
@@ -165,7 +165,7 @@ class LocallyWeightedTranslations(Diffeomorphism):
         return y, push
 
     def jacobian(self, x: Tensor) -> Tensor:
-        points_of(self.dim, x, "x")
+        check_points(self.dim, x, "x")
         if kernels.serves(self, x):
             return kernels.jacobian(self, x)
         columns = torch.eye(self.dim, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], self.dim, self.dim)
@@ -178,7 +178,7 @@ class LocallyWeightedTranslations(Diffeomorphism):
         return columns
 
     def log_abs_det_jacobian(self, x: Tensor) -> Tensor:
-        points_of(self.dim, x, "x")
+        check_points(self.dim, x, "x")
         total = torch.zeros_like(x[..., 0])
         for c, v, q in self._layers():
             w = x - c
@@ -286,7 +286,7 @@ class AffineCouplings(Diffeomorphism):
         return f"dim={self.dim}, n_layers={self.n_layers}, n_features={self.n_features}"
 
     def forward(self, x: Tensor) -> Tensor:
-        points_of(self.dim, x, "x")
+        check_points(self.dim, x, "x")
         parts = [x[..., 0::2], x[..., 1::2]]
         for source, layer in reversed(self._couplings()):
             log_scale, shift = layer(parts[source])
@@ -341,7 +341,7 @@ class AffineCouplings(Diffeomorphism):
         return push(axes.view(self.dim, *[1] * (x.ndim - 1), self.dim).expand(self.dim, *x.shape)).movedim(0, -1)
 
     def log_abs_det_jacobian(self, x: Tensor) -> Tensor:
-        points_of(self.dim, x, "x")
+        check_points(self.dim, x, "x")
         parts = [x[..., 0::2], x[..., 1::2]]
         total = self.scale.log().sum().expand(x.shape[:-1])
         for source, layer in reversed(self._couplings()):
@@ -352,7 +352,7 @@ class AffineCouplings(Diffeomorphism):
 
     def normalize(self, y: Tensor) -> Tensor:
         """(y - center) / scale: (..., n) -> (..., n)."""
-        points_of(self.dim, y, "y")
+        check_points(self.dim, y, "y")
         return (y - self.center) / self.scale
 
     def _couplings(self) -> list[tuple[int, _Coupling]]:

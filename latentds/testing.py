@@ -221,7 +221,7 @@ def _flows(case: _Case) -> None:
         def velocity(_: float, flat: np.ndarray) -> np.ndarray:
             return np.asarray(ds(torch.from_numpy(flat).reshape(starts.shape)).reshape(-1))
 
-        solved = solve_ivp(velocity, (0, times[-1]), starts.numpy().ravel(), "LSODA", times, rtol=1e-6, atol=1e-8)
+        solved = solve_ivp(velocity, (0, times[-1]), starts.numpy().ravel(), "LSODA", times, rtol=1e-7, atol=1e-9)
         _expect(solved.success, f"solve_ivp gave up: {solved.message}")
         expected = torch.from_numpy(solved.y.T.reshape(len(times), *starts.shape)).transpose(0, 1)
         gap = float((ds.rollout(starts, torch.from_numpy(times)) - expected).abs().max())

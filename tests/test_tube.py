@@ -248,7 +248,7 @@ def test_far_starts_and_starts_behind_the_goal_arrive_without_wild_speeds(dim, d
 
 def test_contraction_draws_a_start_back_sooner():
     shown = datasets.unstable_spiral(3, 300)
-    aside = 0.07 * torch.eye(3, dtype=torch.float64)
+    aside = torch.cat([tensor([[0.05, 0.05, 0.0]]), 0.07 * torch.eye(3, dtype=torch.float64)])
     scores = []
     for kappa in (0.5, 20.0):
         ds = fast(3, contraction=kappa).fit(shown)
