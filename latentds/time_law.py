@@ -321,6 +321,10 @@ class TubeDynamics(LatentDynamics):
         reach = radius / float(self.length)
         return min(self.law.slowest_rate(reach), self.pull.slowest_rate(reach))
 
+    def progress(self, x: Tensor) -> Tensor:
+        """s, 1 at the demonstrated start and 0 at x*: (..., n) -> (...)."""
+        return self._split(x)[0].squeeze(-1)
+
     def _split(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Offset from x* in units of length: along the axis (..., 1) and across it (..., n)."""
         offset = (x - self.attractor) / self.length

@@ -28,18 +28,24 @@ Array = NDArray[np.float64]
 
 N_POINTS = 600
 """Points, even in arc length, that ψ is matched on."""
+STRETCHES = (1.0, 2.0, 4.0)
+"""Lengths of the latent line that the straight isotopy starts from, in distances from start to goal."""
 NARROWEST = 3.0
 """Least width 1/ρ of a greedy layer, in distances between those points: a narrower one fits a point with a spike."""
 DECIMALS = 9
 """To which the motion is rounded, in its own sizes."""
 TUBE = 0.02
 """Radius of the tube that the report speaks of, in lengths of the latent line."""
-NEAR = 0.05
-"""Distance from the demonstrated start, in sizes of the motion, of the starts that a match is also judged by."""
-ENOUGH = 0.06
-"""Score below which no further match is refined; three times as much will do after three."""
+NEAR, STARTS = 0.05, 32
+"""Distance from the demonstrated start, in sizes of the motion, and number of the starts that also judge a match."""
+ROWS = 120
+"""Points, even in time, of the rollouts that judge a match."""
 STIFF = 100.0
 """cond(J) along the path above which a match is judged by all of it, below by its root."""
+TRIES, CLOSE = 3, 1.3
+"""So many matches are refined if they score within this factor of the best, …"""
+ENOUGH = 0.06
+"""… and further ones until one scores less than this, or three times this after so many."""
 FAR = 0.25
 """Distance from the axis, in sizes of the motion, beyond which the inward pull stops growing."""
 
@@ -111,8 +117,10 @@ class TubeDS(LatentDS):
                 judged.append((self._score(shape), candidate))
             judged.sort(key=lambda pair: pair[0])
             if self.refined:
-                for tried, (_, candidate) in enumerate(list(judged)):
-                    if tried and min(score for score, _ in judged) < (ENOUGH if tried < 3 else 3 * ENOUGH):
+                for tried, (score, candidate) in enumerate(list(judged)):
+                    close = tried < TRIES and score < CLOSE * judged[0][0]
+                    enough = min(score for score, _ in judged) < ENOUGH * (1 if tried < TRIES else 3)
+                    if tried and enough and not close:
                         break
                     better = candidate.refined(path)
                     self._lay(better, shape, law)
@@ -145,18 +153,25 @@ class TubeDS(LatentDS):
     @torch.no_grad()
     def _score(self, shown: Demonstration) -> float:
         """How badly it rolls out from the demonstrated start (thrice) and NEAR it, times √cond(J), or more."""
-        rows = np.linspace(0, len(shown) - 1, 200).round().astype(int)
-        motion = shown.positions[rows]
-        offsets = NEAR * shown.size * torch.eye(self.dim, dtype=motion.dtype)
-        starts = shown.start + torch.cat([torch.zeros_like(offsets[:1]), offsets, -offsets])
-        paths = self.rollout(starts, shown.times[rows])
-        if not bool(torch.isfinite(paths).all()):
-            return math.inf
-        misses = [dtw(path, motion) / len(rows) / shown.size for path in paths]
+        assert isinstance(self.dynamics, TubeDynamics)
+        around = np.random.default_rng(1).standard_normal((STARTS, self.dim))
+        around *= NEAR * shown.size / np.linalg.norm(around, axis=1, keepdims=True)
+        starts = shown.start + torch.from_numpy(np.concatenate([np.zeros((1, self.dim)), around]))
+        times, step = np.linspace(0, shown.duration, ROWS, retstep=True)
+        paths = self.rollout(starts.to(self.attractor), torch.from_numpy(times)).cpu().numpy()
+        # Which fraction of a step a start is ahead is chance, and would drown the rest where steps are long.
+        share = self.dynamics.progress(self.encode(starts.to(self.attractor))).abs()
+        left = self.dynamics.law.time_to_go(share).cpu().numpy()
+        ahead = (left[0] - left) / step
+        clocks = times + step * (ahead - ahead.round())[:, None]
+        known = shown.times.numpy()
+        motions = np.stack([np.interp(clocks, known, column) for column in shown.positions.numpy().T], axis=-1)
+        misses = [dtw(path, motion) / ROWS / shown.size for path, motion in zip(paths, motions, strict=True)]
         condition = self._condition(self._line())
-        return (3 * misses[0] + float(np.mean(misses[1:]))) * math.sqrt(condition) * max(1.0, condition / STIFF)
+        score = (3 * misses[0] + float(np.mean(misses[1:]))) * math.sqrt(condition) * max(1.0, condition / STIFF)
+        return score if math.isfinite(score) else math.inf
 
-    def _line(self, n_points: int = 150) -> Tensor:
+    def _line(self, n_points: int = N_POINTS) -> Tensor:
         """Latent points from the encoded start to x*, (n_points, n)."""
         assert isinstance(self.dynamics, TubeDynamics)
         share = torch.linspace(1, 0, n_points, dtype=self.attractor.dtype, device=self.attractor.device)
@@ -170,10 +185,10 @@ class TubeDS(LatentDS):
         self, best: Candidate, path: Array, shown: Demonstration, spread: tuple[float, ...], began: float
     ) -> TubeReport:
         assert isinstance(self.dynamics, TubeDynamics)
-        line = self._line()
+        line = self._line(len(path))
         across = torch.linalg.svd(self.dynamics.axis.unsqueeze(-1))[0][:, 1:].T * TUBE * self.dynamics.length
-        tube = torch.cat([line, *(line + side * offset for offset in across for side in (1, -1))])
-        missed = torch.linalg.vector_norm(self.psi(self._line(len(path))).cpu() - torch.from_numpy(path), dim=-1).mean()
+        tube = torch.cat([line, *(line[::4] + side * offset for offset in across for side in (1, -1))])
+        missed = torch.linalg.vector_norm(self.psi(line).cpu() - torch.from_numpy(path), dim=-1).mean()
         y = self.psi(tube)
         step = 1e-6 * shown.size
         nudges = step * torch.eye(self.dim, dtype=y.dtype, device=y.device)
@@ -222,7 +237,7 @@ def _candidates(path: Array, n_layers: int) -> Iterator[Candidate]:
     chord = place(straight_column(len(path)), path[0], path[-1])
     middle = chord.mean(0)
     apart = float(np.linalg.norm(path[1] - path[0]))
-    for stretch in (1.0, 2.0):
+    for stretch in STRETCHES:
         line = middle + stretch * (chord - middle)
         curves = straight_isotopy(line, path, steps)
         yield Candidate("straight", match_along(curves, n_layers, 0.9, 0.9, NARROWEST * apart), line)
