@@ -19,6 +19,15 @@ def test_floor_of_an_even_straight_line():
     assert ablation.sampling_floor(shown) == pytest.approx(2 / 4, rel=0.01)
 
 
+def test_joining_a_straight_line():
+    """Beside its start the offset dies at κ; behind it, m steps h late, m (m+1)/2 h are lost at either end."""
+    way = np.linspace(0, 2, 500)
+    shown, kappa = Demonstration(np.stack([way, 0 * way], 1), 0.01), 20.0
+    beside, behind = ablation.joined(shown, np.array([[0, 0.1], [-5 * way[1], 0]]), kappa)
+    assert beside == pytest.approx(0.1 * np.exp(-kappa * np.linspace(0, 1, 500)).sum(), rel=1e-3)
+    assert behind == pytest.approx(5 * 6 * way[1], rel=1e-3)
+
+
 @pytest.mark.parametrize("isotopy", ["straight", "unbending"])
 def test_one_isotopy_alone(isotopy):
     with ablation.only(isotopy):
