@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 from zlib import crc32
 
@@ -175,14 +176,15 @@ def joints(demonstration: Demonstration, paths: Mapping[str, Any], title: str = 
     figure.suptitle(title or demonstration.name)
     rows = figure.subplots(demonstration.dim, 1, sharex=True, squeeze=False)[:, 0]
     for k, axes in enumerate(rows):
-        for label, batch in moved.items():
+        # A wide pale line beneath, and dashes from the second method on: a rollout that fits hides nothing.
+        name = "" if k else "demonstration"
+        shown = demonstration.positions[:, k].numpy()
+        axes.plot(demonstration.times.numpy(), shown, color="#CCCCCC", lw=5, label=name)
+        for (label, batch), dashes in zip(moved.items(), cycle(("-", "--", ":", "-.")), strict=False):
             times = np.linspace(0, demonstration.duration, batch.shape[1])
             for i, path in enumerate(batch):
                 name = label if k == i == 0 else ""
-                axes.plot(times, path[:, k], color=color_of(label), lw=0.9, alpha=0.6, label=name)
-        name = "" if k else "demonstration"
-        shown = demonstration.positions[:, k].numpy()
-        axes.plot(demonstration.times.numpy(), shown, color=SHOWN, lw=1.5, ls="--", label=name)
+                axes.plot(times, path[:, k], dashes, color=color_of(label), lw=1.2, label=name)
         axes.set_ylabel(f"$y_{{{k + 1}}}$ [{unit}]")
         axes.grid(color="#EEEEEE", lw=0.6)
         axes.spines[["top", "right"]].set_visible(False)
