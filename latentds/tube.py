@@ -28,10 +28,12 @@ Array = NDArray[np.float64]
 
 N_POINTS = 600
 """Points, even in arc length, that ψ is matched on."""
-STRETCHES = (1.0, 2.0, 4.0)
-"""Lengths of the latent line that the straight isotopy starts from, in distances from start to goal."""
-NARROWEST = 3.0
-"""Least width 1/ρ of a greedy layer, in distances between those points: a narrower one fits a point with a spike."""
+STRAIGHT = ((20, 1.0), (20, 2.0), (20, 4.0), (5, 2.0), (5, 4.0))
+"""Matches tried along the straight isotopy: steps, and length of the latent line in distances from start to goal."""
+UNBENDING = ((20, 1.5), (20, 6.0), (20, 12.0), (5, 1.5), (5, 6.0))
+"""And along the unbending one: steps, and least width 1/ρ of a layer in distances between points of the path."""
+WIDTH = 3.0
+"""That of a layer along the straight one: narrower layers fit the path better, and what lies beside it worse."""
 DECIMALS = 9
 """To which the motion is rounded, in its own sizes."""
 TUBE = 0.02
@@ -233,19 +235,20 @@ class Candidate(NamedTuple):
 
 def _candidates(path: Array, n_layers: int) -> Iterator[Candidate]:
     """Matches of a line to the path (N, n), along either isotopy."""
-    steps = max(1, min(20, n_layers // 10))
+    apart = float(np.linalg.norm(np.diff(path, axis=0), axis=1).max())  # less where a corner is cut
     chord = place(straight_column(len(path)), path[0], path[-1])
     middle = chord.mean(0)
-    apart = float(np.linalg.norm(path[1] - path[0]))
-    for stretch in STRETCHES:
+
+    def matched(isotopy: str, curves: Array, width: float) -> Candidate:
+        return Candidate(isotopy, match_along(curves, n_layers, 0.9, 0.9, width * apart), curves[0])
+
+    most = max(1, n_layers // 10)
+    for steps, stretch in STRAIGHT:
         line = middle + stretch * (chord - middle)
-        curves = straight_isotopy(line, path, steps)
-        yield Candidate("straight", match_along(curves, n_layers, 0.9, 0.9, NARROWEST * apart), line)
+        yield matched("straight", straight_isotopy(line, path, min(steps, most)), WIDTH)
     if path.shape[1] > 1:
-        curves = unbending_isotopy(path, steps)
-        for share, beta, wider in ((1.0, 0.9, 0.5), (1.0, 0.9, 2.0), (0.4, 0.3, 2.0)):
-            layers = match_along(curves, math.ceil(share * n_layers), beta, 0.9, wider * NARROWEST * apart)
-            yield Candidate("unbending", layers, curves[0])
+        for steps, width in UNBENDING:
+            yield matched("unbending", unbending_isotopy(path, min(steps, most)), width)
 
 
 def mean_motion(shown: Sequence[Demonstration]) -> tuple[Demonstration, tuple[float, ...]]:
