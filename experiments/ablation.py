@@ -256,14 +256,9 @@ def sampling_floor(shown: Demonstration, count: int = 100) -> float:
 
     Off the demonstrated start nobody knows the clock: even a perfect rollout is late by some such fraction.
     """
-    known, times, reference = shown.times.numpy(), PROTOCOL.times(shown).numpy(), PROTOCOL.reference(shown)
-    step = times[1] - times[0]
-    scores = [
-        metrics.dtw(
-            np.stack([np.interp(times + share * step, known, c) for c in shown.positions.numpy().T], 1), reference
-        )
-        for share in (np.arange(count) + 0.5) / count
-    ]
+    times, reference = PROTOCOL.times(shown).numpy(), PROTOCOL.reference(shown)
+    late = (np.arange(count) + 0.5) / count * (times[1] - times[0])
+    scores = [metrics.dtw(shown.at(times + seconds), reference) for seconds in late]
     return float(np.mean(scores))
 
 
@@ -272,9 +267,9 @@ def joined(shown: Demonstration, starts: np.ndarray, kappa: float = 20.0) -> lis
 
     The way there shrinks at ``kappa``, as in a tube without any error; a start behind the first point is late.
     """
-    known, times, reference = shown.times.numpy(), PROTOCOL.times(shown).numpy(), PROTOCOL.reference(shown)
+    times, reference = PROTOCOL.times(shown).numpy(), PROTOCOL.reference(shown)
     fine = np.linspace(0, shown.duration, 20_001)
-    path = np.stack([np.interp(fine, known, column) for column in shown.positions.numpy().T], 1)
+    path = shown.at(fine)
     speed, scores = (path[1] - path[0]) / fine[1], []
     for start in starts:
         nearest = int(np.linalg.norm(path - start, axis=1).argmin())
@@ -282,8 +277,7 @@ def joined(shown: Demonstration, starts: np.ndarray, kappa: float = 20.0) -> lis
         if nearest == 0:
             late = -float(away @ speed / (speed @ speed))
         clocks = times + fine[nearest] - late
-        motion = np.stack([np.interp(clocks, fine, column) for column in path.T], 1)
-        motion += np.minimum(clocks, 0)[:, None] * speed
+        motion = shown.at(clocks) + np.minimum(clocks, 0)[:, None] * speed
         motion += np.exp(-kappa * times / shown.duration)[:, None] * (away + late * speed)
         scores.append(metrics.dtw(motion, reference))
     return scores

@@ -79,8 +79,7 @@ class Protocol:
 
     def reference(self, demonstration: Demonstration) -> NDArray[np.float64]:
         """The demonstration at :meth:`times`, (n_points, n)."""
-        wanted, known = self.times(demonstration).numpy(), demonstration.times.numpy()
-        return np.stack([np.interp(wanted, known, column) for column in demonstration.positions.numpy().T], axis=1)
+        return demonstration.at(self.times(demonstration).numpy())
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from typing import IO, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from .arguments import point_array, positive, real_array
@@ -90,6 +91,11 @@ class Demonstration:
     def size(self) -> float:
         """Largest extent along a coordinate axis, in the units of the positions."""
         return float((self.positions.amax(0) - self.positions.amin(0)).max())
+
+    def at(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Positions at ``times`` (...), seconds, linear between the points and held beyond the ends: (..., n)."""
+        known = self.times.numpy()
+        return np.stack([np.interp(times, known, column) for column in self.positions.numpy().T], axis=-1)
 
     @property
     def fingerprint(self) -> tuple[str, str]:

@@ -30,8 +30,8 @@ N_POINTS = 600
 """Points, even in arc length, that ψ is matched on."""
 STRAIGHT = ((20, 1.0), (20, 2.0), (20, 4.0), (5, 2.0), (5, 4.0))
 """Matches tried along the straight isotopy: steps, and length of the latent line in distances from start to goal."""
-UNBENDING = ((20, 1.5), (20, 6.0), (20, 12.0), (5, 1.5), (5, 6.0))
-"""And along the unbending one: steps, and least width 1/ρ of a layer in distances between points of the path."""
+UNBENDING = ((20, (1.5, 6.0, 12.0)), (5, (1.5, 6.0)))
+"""And along the unbending one: steps, and least widths 1/ρ of a layer in distances between points of the path."""
 WIDTH = 3.0
 """That of a layer along the straight one: narrower layers fit the path better, and what lies beside it worse."""
 DECIMALS = 9
@@ -159,24 +159,23 @@ class TubeDS(LatentDS):
         around = np.random.default_rng(1).standard_normal((STARTS, self.dim))
         around *= NEAR * shown.size / np.linalg.norm(around, axis=1, keepdims=True)
         starts = shown.start + torch.from_numpy(np.concatenate([np.zeros((1, self.dim)), around]))
+        starts = starts.to(self.attractor)
         times, step = np.linspace(0, shown.duration, ROWS, retstep=True)
-        paths = self.rollout(starts.to(self.attractor), torch.from_numpy(times)).cpu().numpy()
+        paths = self.rollout(starts, torch.from_numpy(times)).cpu().numpy()
         # Which fraction of a step a start is ahead is chance, and would drown the rest where steps are long.
-        share = self.dynamics.progress(self.encode(starts.to(self.attractor))).abs()
+        share = self.dynamics.progress(self.encode(starts)).abs()
         left = self.dynamics.law.time_to_go(share).cpu().numpy()
         ahead = (left[0] - left) / step
         clocks = times + step * (ahead - ahead.round())[:, None]
-        known = shown.times.numpy()
-        motions = np.stack([np.interp(clocks, known, column) for column in shown.positions.numpy().T], axis=-1)
-        misses = [dtw(path, motion) / ROWS / shown.size for path, motion in zip(paths, motions, strict=True)]
+        misses = [dtw(path, motion) / ROWS / shown.size for path, motion in zip(paths, shown.at(clocks), strict=True)]
         condition = self._condition(self._line())
         score = (3 * misses[0] + float(np.mean(misses[1:]))) * math.sqrt(condition) * max(1.0, condition / STIFF)
         return score if math.isfinite(score) else math.inf
 
-    def _line(self, n_points: int = N_POINTS) -> Tensor:
-        """Latent points from the encoded start to x*, (n_points, n)."""
+    def _line(self) -> Tensor:
+        """Latent points from the encoded start to x*, one for each of the path, (N_POINTS, n)."""
         assert isinstance(self.dynamics, TubeDynamics)
-        share = torch.linspace(1, 0, n_points, dtype=self.attractor.dtype, device=self.attractor.device)
+        share = torch.linspace(1, 0, N_POINTS, dtype=self.attractor.dtype, device=self.attractor.device)
         return self.dynamics.attractor + share.unsqueeze(-1) * self.dynamics.length * self.dynamics.axis
 
     def _condition(self, line: Tensor) -> float:
@@ -187,7 +186,7 @@ class TubeDS(LatentDS):
         self, best: Candidate, path: Array, shown: Demonstration, spread: tuple[float, ...], began: float
     ) -> TubeReport:
         assert isinstance(self.dynamics, TubeDynamics)
-        line = self._line(len(path))
+        line = self._line()
         across = torch.linalg.svd(self.dynamics.axis.unsqueeze(-1))[0][:, 1:].T * TUBE * self.dynamics.length
         tube = torch.cat([line, *(line[::4] + side * offset for offset in across for side in (1, -1))])
         missed = torch.linalg.vector_norm(self.psi(line).cpu() - torch.from_numpy(path), dim=-1).mean()
@@ -247,8 +246,10 @@ def _candidates(path: Array, n_layers: int) -> Iterator[Candidate]:
         line = middle + stretch * (chord - middle)
         yield matched("straight", straight_isotopy(line, path, min(steps, most)), WIDTH)
     if path.shape[1] > 1:
-        for steps, width in UNBENDING:
-            yield matched("unbending", unbending_isotopy(path, min(steps, most)), width)
+        for steps, widths in UNBENDING:
+            curves = unbending_isotopy(path, min(steps, most))
+            for width in widths:
+                yield matched("unbending", curves, width)
 
 
 def mean_motion(shown: Sequence[Demonstration]) -> tuple[Demonstration, tuple[float, ...]]:

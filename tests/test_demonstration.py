@@ -285,3 +285,9 @@ def test_demonstrations_of(shown):
         demonstrations_of([shown], 3)
     with pytest.raises(ValueError, match="demonstration: Method learns from exactly one, got 2"):
         only_demonstration([shown, shown], 2, "Method")
+
+
+def test_positions_at_any_time():
+    shown = Demonstration([[0, 1], [2, 1], [2, 5.0]], 0.5)
+    found = shown.at(np.array([[-1, 0.25], [0.5, 9]]))
+    np.testing.assert_allclose(found, [[[0, 1], [1, 1]], [[2, 1], [2, 5]]])
