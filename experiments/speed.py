@@ -33,7 +33,9 @@ from experiments import report
 from latentds import ChebyshevDS, datasets, kernels
 from latentds.diffeomorphism import WIDTH_BOUND
 from latentds.embedding import chebyshev_columns, place
-from latentds.lanes import WIDTH, load, store
+from latentds.kernels.compiling import OPTIONS
+from latentds.kernels.dispatch import BLOCK
+from latentds.kernels.lanes import WIDTH, exp, load, store
 from latentds.matching import match
 
 N_LAYERS = 150
@@ -115,15 +117,15 @@ def loop_match(x: np.ndarray, y: np.ndarray, n_layers: int, beta: float, mu: flo
 # --- the floor --------------------------------------------------------------------------------------------------------
 
 
-@numba.njit(**kernels.OPTIONS)
+@numba.njit(**OPTIONS)
 def exponentials(buffer: np.ndarray, repeats: int) -> None:
     """One exponential for each of ``BLOCK`` numbers in the L1 cache."""
     for _ in range(repeats):
-        for u in range(0, kernels.BLOCK, WIDTH):
-            store(buffer, u, kernels._exp(load(buffer, u, WIDTH) * -1.0))
+        for u in range(0, BLOCK, WIDTH):
+            store(buffer, u, exp(load(buffer, u, WIDTH) * -1.0))
 
 
-@numba.njit(**kernels.OPTIONS)
+@numba.njit(**OPTIONS)
 def products(buffer: np.ndarray, repeats: int) -> None:
     """Twelve independent chains of multiply-add in registers."""
     m = load(buffer, 0, WIDTH)
@@ -208,7 +210,7 @@ def latent_points(ds: ChebyshevDS, count: int, seed: int = 0) -> Tensor:
 
 def against_floor(ds: ChebyshevDS, rounds: int) -> list[Goal]:
     layers, x = loop_of(ds), latent_points(ds, 100_000)
-    buffer, repeats = np.full(kernels.BLOCK, 0.5), 20_000
+    buffer, repeats = np.full(BLOCK, 0.5), 20_000
     times = take_turns(
         {
             "decode": lambda: ds.decode(x),
@@ -217,7 +219,7 @@ def against_floor(ds: ChebyshevDS, rounds: int) -> list[Goal]:
         },
         rounds,
     )
-    each_exp = times["exponentials"] / repeats / kernels.BLOCK
+    each_exp = times["exponentials"] / repeats / BLOCK
     each_product = times["products"] / repeats / 12 / WIDTH
     floor = (each_exp + operations(3) * each_product) * N_LAYERS * len(x)
     loop = take_turns({"decode": lambda: ds.decode(x), "loop": lambda: loop_forward(layers, x)}, max(3, rounds // 4))

@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from . import kernels
 from .base import LatentDS, StableDS
 from .diffeomorphism import LocallyWeightedTranslations
+from .kernels.translations import layers_of
+from .kernels.velocity import velocity_kernel
 from .time_law import ChebyshevLaw, PiecewiseLinearLaw, RayDynamics, TimeLaw, TubeDynamics
 
 Array = NDArray[np.float64]
@@ -41,7 +42,7 @@ class Controller:
         if numbers is None:
             self._ds = copy.deepcopy(ds).requires_grad_(False)
         else:
-            self._numbers, self._kernel = numbers, kernels.steer(self.dim)
+            self._numbers, self._kernel = numbers, velocity_kernel(self.dim)
             self._local = threading.local()
         self(np.zeros(self.dim))
 
@@ -96,7 +97,7 @@ def _real(y: Any) -> Array:
 
 
 def _numbers(ds: StableDS) -> tuple[Array, Array, Array, Array] | None:
-    """The system as :func:`latentds.kernels.steer` reads it: layers, goal, and both rates; None if it cannot."""
+    """The system as the velocity kernel reads it: layers, goal, and both rates; None if it cannot."""
     if not isinstance(ds, LatentDS) or type(ds).forward is not LatentDS.forward:
         return None
     psi, dynamics = ds.diffeomorphism, ds.dynamics
@@ -112,7 +113,7 @@ def _numbers(ds: StableDS) -> tuple[Array, Array, Array, Array] | None:
     if along is None or across is None:
         return None
     goal = np.stack([_array(dynamics.attractor), axis, np.full(ds.dim, float(dynamics.length))])
-    layers = kernels.layers_of(copy.deepcopy(psi).to("cpu", torch.float64))
+    layers = layers_of(copy.deepcopy(psi).to("cpu", torch.float64))
     return layers, goal, along, across
 
 

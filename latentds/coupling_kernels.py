@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .kernels import cached
+from .kernels.compiling import cached
 
 F32 = np.float32
 Array = Any

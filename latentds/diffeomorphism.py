@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from . import kernels
 from .arguments import check_points, positive, whole_number
 from .coupling_kernels import Couplings
+from .kernels import translations
 
 WIDTH_BOUND = math.sqrt(math.e / 2)
 """A layer x + exp(-ρ²‖x-c‖²) v is invertible while ρ‖v‖ < √(e/2) (Perrin and Schlehuber-Caissier 2016)."""
@@ -133,24 +133,24 @@ class LocallyWeightedTranslations(Diffeomorphism):
 
     def forward(self, x: Tensor) -> Tensor:
         check_points(self.dim, x, "x")
-        if kernels.serves(self, x):
-            return kernels.forward(self, x)
+        if translations.can_use_kernel(self, x):
+            return translations.forward(self, x)
         for c, v, q in self._layers():
             x = x + torch.exp(-q * (x - c).square().sum(-1, keepdim=True)) * v
         return x
 
     def inverse(self, y: Tensor) -> Tensor:
         check_points(self.dim, y, "y")
-        if kernels.serves(self, y):
-            return kernels.inverse(self, y)
+        if translations.can_use_kernel(self, y):
+            return translations.inverse(self, y)
         for c, v, q in reversed(self._layers()):
             y = y - _root(y - c, v, q) * v
         return y
 
     def linearize(self, y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         check_points(self.dim, y, "y")
-        if kernels.serves(self, y):
-            return kernels.linearize(self, y)
+        if translations.can_use_kernel(self, y):
+            return translations.linearize(self, y)
         steps = []
         for c, v, q in reversed(self._layers()):
             k = _root(y - c, v, q)
@@ -166,8 +166,8 @@ class LocallyWeightedTranslations(Diffeomorphism):
 
     def jacobian(self, x: Tensor) -> Tensor:
         check_points(self.dim, x, "x")
-        if kernels.serves(self, x):
-            return kernels.jacobian(self, x)
+        if translations.can_use_kernel(self, x):
+            return translations.jacobian(self, x)
         columns = torch.eye(self.dim, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], self.dim, self.dim)
         for c, v, q in self._layers():
             w = x - c

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from . import kernels
 from .base import FitReport, LatentDS
 from .demonstration import Demonstration, goal_apart
 from .diffeomorphism import WIDTH_BOUND, Layers, LocallyWeightedTranslations
 from .isotopy import straight_isotopy
+from .kernels.greedy import greedy_kernel
 from .refinement import refine
 from .time_law import RayDynamics, TimeLaw
 
@@ -43,7 +43,7 @@ def advance(
     rows = np.empty((n_layers, 2 * dim + 1))
     limit = 1 / narrowest**2 if narrowest > 0 else math.inf
     target = np.ascontiguousarray(y, dtype=np.float64)
-    used = kernels.greedy()(moved, target, beta, (mu * WIDTH_BOUND) ** 2, limit, at, rows)
+    used = greedy_kernel()(moved, target, beta, (mu * WIDTH_BOUND) ** 2, limit, at, rows)
     return Layers(rows[:used, :dim], rows[:used, dim:-1], np.sqrt(rows[:used, -1])), moved
 
 

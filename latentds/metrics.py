@@ -13,7 +13,7 @@ from fastdtw import fastdtw
 from numpy.typing import NDArray
 
 from .arguments import real_array, whole_number
-from .kernels import cached
+from .kernels.compiling import cached
 
 Array = NDArray[np.float64]
 NAN = float("nan")

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from .diffeomorphism import WIDTH_BOUND, Layers
-from .kernels import cached
+from .kernels.compiling import cached
 
 Array = NDArray[np.float64]
 

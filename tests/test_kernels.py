@@ -16,8 +16,9 @@ import torch
 import torch.autograd.forward_ad as forward_ad
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from latentds import ChebyshevDS, LocallyWeightedTranslations, datasets, kernels, warmup
+from latentds import ChebyshevDS, LocallyWeightedTranslations, datasets, warmup
 from latentds.diffeomorphism import WIDTH_BOUND
+from latentds.kernels import compiling, dispatch, lanes, translations
 
 OPERATIONS = ("forward", "inverse", "jacobian")
 
@@ -41,7 +42,7 @@ def both(function):
     """The value by the kernels and by torch."""
     with torch.no_grad():
         fast = function()
-        with kernels.reference():
+        with dispatch.reference():
             return fast, function()
 
 
@@ -58,7 +59,7 @@ def assert_equal(fast, slow, dtype=torch.float64):
 @pytest.mark.parametrize("dim", [1, 2, 3, 7])
 def test_both_paths_agree(operation, dtype, dim):
     psi, points = random_map(dim, dtype=dtype), random_points(1100, dim, dtype=dtype)
-    assert kernels.serves(psi, points)
+    assert translations.can_use_kernel(psi, points)
     assert_equal(*both(lambda: getattr(psi, operation)(points)), dtype)
 
 
@@ -110,11 +111,11 @@ def test_a_point_gets_the_same_answer_alone_and_in_a_crowd():
 
 def test_exponential():
     x = np.concatenate([np.linspace(-649, 0, 5001), -np.geomspace(1e-300, 1, 200)])
-    value = np.array([kernels._exp(float(v)) for v in x])
+    value = np.array([lanes.exp(float(v)) for v in x])
     assert np.abs(value / np.exp(x) - 1).max() < 2e-13  # |x| times the rounding of ln 2: weights below e^-60 do not act
     near = x > -2
     assert np.abs(value / np.exp(x) - 1)[near].max() < 6e-16
-    assert all(kernels._exp(v) == 0.0 for v in (-650.5, -746.0, -1e6, -1e300, -math.inf))
+    assert all(lanes.exp(v) == 0.0 for v in (-650.5, -746.0, -1e6, -1e300, -math.inf))
 
 
 @pytest.mark.parametrize("operation", OPERATIONS)
@@ -148,7 +149,7 @@ def test_inverse_never_fails(dim):
     points = center[:, None] + along + 0.3 * rng.standard_normal((count, 9, dim)) / widths[:, None, None]
     points[:, 0], points[:, 1] = center, center + direction
     crowd, alone = np.empty((9, dim)), np.empty((1, dim))
-    crowd_kernel, alone_kernel = kernels._unwind(dim, kernels.BLOCK), kernels._unwind(dim, 1)
+    crowd_kernel, alone_kernel = translations.inverse_kernel(dim, dispatch.BLOCK), translations.inverse_kernel(dim, 1)
     for j in range(count):
         y, layer = points[j], layers[j : j + 1]
         crowd_kernel(layer, y, crowd)
@@ -173,10 +174,10 @@ def test_gradients_of_parameters_are_those_of_the_torch_path(operation):
         second = torch.autograd.grad(sum(g.square().sum() for g in first), parameters)
         return value, *first, *second
 
-    assert kernels.serves(psi, points)
+    assert translations.can_use_kernel(psi, points)
     fast = gradients()
     assert "Recomputed" in type(fast[0].grad_fn).__name__
-    with kernels.reference():
+    with dispatch.reference():
         slow = gradients()
     for one, other in zip(fast, slow, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-11)
@@ -186,7 +187,7 @@ def test_gradients_through_the_velocity():
     ds = ChebyshevDS(2, n_layers=10).fit(datasets.archimedean_spiral(50))
     points, parameters = 0.05 * random_points(5, 2), tuple(ds.parameters())
     fast = torch.autograd.grad(ds(points).square().sum(), parameters)
-    with kernels.reference():
+    with dispatch.reference():
         slow = torch.autograd.grad(ds(points).square().sum(), parameters)
     for one, other in zip(fast, slow, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-8, atol=1e-12)
@@ -197,7 +198,7 @@ def test_gradients_reach_parameters_that_were_swapped_in():
     swapped = {name: torch.nn.Parameter(value.detach()) for name, value in other.named_parameters()}
     value = torch.func.functional_call(psi, swapped, (points,))
     found = torch.autograd.grad(value.sum(), list(swapped.values()))
-    with kernels.reference():
+    with dispatch.reference():
         expected = torch.autograd.grad(other(points).sum(), list(other.parameters()))
     for one, wanted in zip(found, expected, strict=True):
         torch.testing.assert_close(one, wanted)
@@ -233,23 +234,23 @@ def test_transforms_of_a_tangent_map_made_outside_them():
 
 def test_the_rule():
     psi, points = random_map(2), random_points(3, 2)
-    assert kernels.serves(psi, points)
-    assert not kernels.serves(psi, points.float())
-    assert not kernels.serves(psi, points.to("meta"))
-    assert not kernels.serves(psi, points.half())
-    assert not kernels.serves(psi, points.as_subclass(type("Marked", (torch.Tensor,), {})))
+    assert translations.can_use_kernel(psi, points)
+    assert not translations.can_use_kernel(psi, points.float())
+    assert not translations.can_use_kernel(psi, points.to("meta"))
+    assert not translations.can_use_kernel(psi, points.half())
+    assert not translations.can_use_kernel(psi, points.as_subclass(type("Marked", (torch.Tensor,), {})))
     asked = points.clone().requires_grad_()
-    assert not kernels.serves(psi, asked)
+    assert not translations.can_use_kernel(psi, asked)
     with torch.no_grad():
-        assert kernels.serves(psi, asked)
-    with kernels.reference():
-        assert not kernels.serves(psi, points)
+        assert translations.can_use_kernel(psi, asked)
+    with dispatch.reference():
+        assert not translations.can_use_kernel(psi, points)
     with FakeTensorMode():
-        assert not kernels.serves(psi, points)
+        assert not translations.can_use_kernel(psi, points)
     with forward_ad.dual_level():
-        assert not kernels.serves(psi, points)
+        assert not translations.can_use_kernel(psi, points)
     torch.nn.utils.parametrize.register_parametrization(psi, "centers", torch.nn.Identity())
-    assert not kernels.serves(psi, points)
+    assert not translations.can_use_kernel(psi, points)
 
 
 def test_traced_and_exported_programs_hold_torch_operations():
@@ -305,7 +306,7 @@ def test_copies_compute_the_same(copied):
 
 
 def test_cores_share_the_rows(monkeypatch):
-    monkeypatch.setattr(kernels, "_available_cores", lambda: 3)
+    monkeypatch.setattr(dispatch, "_available_cores", lambda: 3)
     threads = torch.get_num_threads()
     psi, points = random_map(3), random_points(20_000, 3)
     try:
@@ -329,7 +330,7 @@ def decoded(connection, psi, points):
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 def test_forked_processes_have_their_own_threads(monkeypatch):
-    monkeypatch.setattr(kernels, "_ALONE", 0)
+    monkeypatch.setattr(dispatch, "PARALLEL_THRESHOLD", 0)
     psi, points = random_map(3), random_points(1000, 3)
     with torch.no_grad():
         expected = psi(points)
@@ -352,12 +353,12 @@ def test_compiling_where_no_cache_can_be_kept(monkeypatch, capsys):
 
     njit, ticks = numba.njit, iter([0.0, 5.0])
     monkeypatch.setattr(numba, "njit", refusing)
-    monkeypatch.setattr(kernels.time, "perf_counter", lambda: next(ticks))
+    monkeypatch.setattr(compiling.time, "perf_counter", lambda: next(ticks))
 
     def twice(x):
         return 2 * x
 
-    assert kernels.compiled(twice, "float64(float64)")(1.5) == 3.0
+    assert compiling.compiled(twice, "float64(float64)")(1.5) == 3.0
     assert capsys.readouterr().err == "latentds: compiled twice for this CPU in 5.0 s\n"
 
 

@@ -1,0 +1,22 @@
+"""Compiled CPU kernels: what they compute, when they run, how they are compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from .dispatch import BLOCK
+from .greedy import greedy_kernel
+from .translations import forward_kernel, inverse_kernel, pack_kernel
+from .velocity import velocity_kernel
+
+
+def warmup(dims: Sequence[int] = (2, 3)) -> None:
+    """Compile the kernels for points of these dimensions now; otherwise their first use does, some seconds each."""
+    for dim in dims:
+        for block in (1, BLOCK):
+            inverse_kernel(dim, block)
+            for tangents in {0, 1, dim}:
+                forward_kernel(dim, tangents, block)
+        velocity_kernel(dim)
+    pack_kernel()
+    greedy_kernel()

@@ -1,0 +1,162 @@
+"""The one rule that says when a compiled kernel runs, and how its rows are spread over cores."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.autograd import forward_ad
+
+Array = NDArray[np.float64]
+
+BLOCK = 512
+"""Points that go through the layers together: with what a layer needs of them they fit the L1 cache for n = 3."""
+
+_local = threading.local()
+
+
+def can_use_kernel(names: Sequence[str], module: nn.Module, *tensors: Tensor) -> bool:
+    """Whether a kernel may compute ``module``, whose parameters have these names; if not, the torch path does.
+
+    They serve plain CPU tensors in the module's own float32 or float64 of which no derivative is asked. Never under
+    torch.func, forward-mode differentiation, tracing, compiling, export or any active torch mode: those see a torch
+    operation only when there is one. If grad mode is on and only the parameters require a gradient, the kernels
+    compute the value, and the backward pass recomputes it by the torch path.
+    """
+    if not no_active_transforms() or (torch.is_grad_enabled() and any(t.requires_grad for t in tensors)):
+        return False
+    learned = [module._parameters.get(name) for name in names]
+    dtype = tensors[0].dtype
+    return dtype in (torch.float64, torch.float32) and all(is_plain(t, dtype) for t in (*tensors, *learned))
+
+
+def no_active_transforms() -> bool:
+    """Whether nothing watches or transforms torch operations at the moment: tracing, torch.func, a torch mode."""
+    return not (
+        torch.compiler.is_compiling()
+        or torch._C._get_tracing_state() is not None
+        or getattr(_local, "reference", False)
+        or torch._C._len_torch_function_stack()
+        or torch._C._len_torch_dispatch_stack()
+        or torch._C._functorch.peek_interpreter_stack() is not None
+        or forward_ad._current_level >= 0
+    )
+
+
+def is_plain(tensor: Any, dtype: torch.dtype) -> bool:
+    """Whether a kernel can read its memory: no subclass, on the CPU, of this dtype, no lazy negation."""
+    return type(tensor) in (Tensor, nn.Parameter) and tensor.is_cpu and tensor.dtype is dtype and not tensor.is_neg()
+
+
+@contextmanager
+def reference() -> Iterator[None]:
+    """Within this context, in this thread, everything takes the torch path."""
+    before, _local.reference = getattr(_local, "reference", False), True
+    try:
+        yield
+    finally:
+        _local.reference = before
+
+
+class _Recomputed(torch.autograd.Function):
+    """A value from a kernel whose backward pass runs the torch path again, on the very tensors of the forward pass."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        compute: Callable[..., Tensor],
+        torch_path: Callable[..., Tensor],
+        names: Sequence[str],
+        module: nn.Module,
+        *tensors: Tensor,
+    ) -> Tensor:
+        ctx.torch_path, ctx.names, ctx.module = torch_path, names, module
+        ctx.save_for_backward(*tensors)
+        return compute(*tensors[: -len(names)])
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Any:
+        again = torch.is_grad_enabled()
+        with torch.enable_grad(), reference():
+            # Views, so that the gradient for one input does not also flow through another made from it.
+            inputs = [tensor.view_as(tensor) for tensor in ctx.saved_tensors]
+            points, learned = inputs[: -len(ctx.names)], inputs[-len(ctx.names) :]
+            twin: Any = object.__new__(type(ctx.module))
+            twin.__dict__.update(ctx.module.__dict__, _parameters=dict(zip(ctx.names, learned, strict=True)))
+            value = ctx.torch_path(twin, *points)
+        asked = [tensor for tensor, needed in zip(inputs, ctx.needs_input_grad[4:], strict=True) if needed]
+        found = iter(torch.autograd.grad(value, asked, gradient, create_graph=again, allow_unused=True))
+        return None, None, None, None, *(next(found) if needed else None for needed in ctx.needs_input_grad[4:])
+
+
+def evaluate(
+    compute: Callable[..., Tensor],
+    torch_path: Callable[..., Tensor],
+    names: Sequence[str],
+    module: nn.Module,
+    *tensors: Tensor,
+) -> Tensor:
+    """``compute`` of the tensors, with a graph that leads to ``torch_path`` of the module if one is asked for."""
+    if torch.is_grad_enabled():
+        learned = [module._parameters[name] for name in names]
+        if any(t.requires_grad for t in (*tensors, *learned)):  # type: ignore[union-attr]
+            return _Recomputed.apply(compute, torch_path, names, module, *tensors, *learned)  # type: ignore[no-any-return,no-untyped-call]
+    return compute(*tensors)
+
+
+def rows_of(x: Tensor) -> Array:
+    """(..., n) -> (m, n) float64, contiguous; shares memory where it can."""
+    points = x.detach().numpy()
+    return np.ascontiguousarray(points.reshape(points.size // points.shape[-1], points.shape[-1]), np.float64)
+
+
+def tensor_of(rows: Array, like: Tensor, shape: Sequence[int]) -> Tensor:
+    """The rows in another tensor's dtype and in the given shape."""
+    return torch.from_numpy(rows).to(like.dtype).reshape(shape)
+
+
+PARALLEL_THRESHOLD = 300_000
+"""Point-layers above which more than one core is used; below, a second one costs more than it brings."""
+
+_pool: ThreadPoolExecutor | None = None
+_pool_owner = 0
+
+
+def run(kernel_for: Callable[[int], Callable[..., None]], layers: Array, *by_row: Array) -> None:
+    """Call a kernel on rows of points, on as many cores as torch may use here for a large batch."""
+    count = len(by_row[-1])
+    if count == 0:
+        return
+    kernel = kernel_for(1 if count == 1 else BLOCK)
+    cores = min(torch.get_num_threads(), _available_cores()) if count * len(layers) > PARALLEL_THRESHOLD else 1
+    if cores == 1:
+        kernel(layers, *by_row)
+        return
+    share = -(-count // (2 * cores * BLOCK)) * BLOCK
+    cuts = range(0, count, share)
+    tasks = [
+        _workers(cores).submit(kernel, layers, *(a[cut : cut + share] if len(a) == count else a for a in by_row))
+        for cut in cuts
+    ]
+    for task in tasks:
+        task.result()
+
+
+def _available_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _workers(cores: int) -> ThreadPoolExecutor:
+    """Our own threads, so that no global thread count is touched; new ones after a fork, which copies none."""
+    global _pool, _pool_owner
+    if _pool is None or _pool_owner != os.getpid():
+        _pool, _pool_owner = ThreadPoolExecutor(max(cores, _available_cores()), "latentds"), os.getpid()
+    return _pool

@@ -1,0 +1,309 @@
+"""Compiled CPU kernels behind locally weighted translations.
+
+A kernel takes points in blocks, held coordinate by coordinate in the L1 cache, sends a block through all layers and
+carries eight points at a time through the arithmetic (:mod:`latentds.kernels.lanes`). Layers that move no point of a
+vector by a rounding error are skipped for it. Everything is computed in float64: a float32 module gets its answer
+rounded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from . import dispatch
+from .compiling import OPTIONS, compiled
+from .dispatch import evaluate, is_plain, no_active_transforms, rows_of, run, tensor_of
+from .lanes import WIDTH, anywhere, either, exp, load, store, where
+
+Array = NDArray[np.float64]
+
+PARAMETERS = ("centers", "log_widths", "strengths")
+"""Of the module, in the order in which the kernels take them."""
+
+NEGLIGIBLE = 60.0
+"""A layer with exp(-60) = 9e-27 of its translation at a point leaves the point as it is."""
+
+BEYOND = 80.0
+"""ρ²‖y-c‖² from which the layer's solution s lies below exp(-60): √80 >= √60 + ρ‖v‖, since ρ‖v‖ < √(e/2)."""
+
+can_use_kernel = partial(dispatch.can_use_kernel, PARAMETERS)
+
+
+def forward(module: Any, x: Tensor) -> Tensor:
+    """ψ of a :class:`~latentds.LocallyWeightedTranslations`; so are those below."""
+    return evaluate(partial(_forward, layers_of(module)), type(module).forward, PARAMETERS, module, x)
+
+
+def inverse(module: Any, y: Tensor) -> Tensor:
+    return evaluate(partial(_inverse, layers_of(module)), type(module).inverse, PARAMETERS, module, y)
+
+
+def jacobian(module: Any, x: Tensor) -> Tensor:
+    return evaluate(partial(_jacobian, layers_of(module)), type(module).jacobian, PARAMETERS, module, x)
+
+
+def linearize(module: Any, y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+    layers = layers_of(module)
+    x = evaluate(partial(_inverse, layers), type(module).inverse, PARAMETERS, module, y)
+
+    def push(tangent: Tensor) -> Tensor:
+        if not (no_active_transforms() and is_plain(tangent, x.dtype)):
+            return _pushed(module, x, tangent)
+        points, tangents = torch.broadcast_tensors(x, tangent)  # type: ignore[no-untyped-call]
+        return evaluate(partial(_push, layers), _pushed, PARAMETERS, module, points, tangents)
+
+    return x, push
+
+
+def _pushed(module: Any, x: Tensor, tangent: Tensor) -> Tensor:
+    moved: Tensor = module.jacobian(x) @ tangent.unsqueeze(-1)
+    return moved.squeeze(-1)
+
+
+def _forward(layers: Array, x: Tensor) -> Tensor:
+    points = rows_of(x)
+    out, nothing = np.empty_like(points), np.empty((1, 0))
+    kernel = partial(forward_kernel, points.shape[1], 0)
+    run(kernel, layers, points, nothing, out, np.empty((len(points), 0)))
+    return tensor_of(out, x, x.shape)
+
+
+def _inverse(layers: Array, y: Tensor) -> Tensor:
+    points = rows_of(y)
+    out = np.empty_like(points)
+    run(partial(inverse_kernel, points.shape[1]), layers, points, out)
+    return tensor_of(out, y, y.shape)
+
+
+def _push(layers: Array, x: Tensor, tangent: Tensor) -> Tensor:
+    points, tangents = rows_of(x), rows_of(tangent)
+    moved, out = np.empty_like(points), np.empty_like(tangents)
+    run(partial(forward_kernel, points.shape[1], 1), layers, points, tangents, moved, out)
+    return tensor_of(out, x, x.shape)
+
+
+def _jacobian(layers: Array, x: Tensor) -> Tensor:
+    points, dim = rows_of(x), x.shape[-1]
+    moved, out = np.empty_like(points), np.empty((len(points), dim * dim))
+    run(partial(forward_kernel, dim, dim), layers, points, np.eye(dim).reshape(1, -1), moved, out)
+    return tensor_of(out, x, (*x.shape, dim))
+
+
+def layers_of(module: Any) -> Array:
+    """The layers as the kernels read them, a row (c, v, ρ², ρ²‖v‖²) each: (M, 2n+2).
+
+    Made anew for every call, in some microseconds, so that it is never stale.
+    """
+    arrays = [module._parameters[name].detach().numpy() for name in PARAMETERS]  # type: ignore[union-attr]
+    return pack_kernel()(*(np.ascontiguousarray(a, dtype=np.float64) for a in arrays))  # type: ignore[no-any-return]
+
+
+@numba.njit(inline="always", **OPTIONS)  # type: ignore[untyped-decorator]
+def _doubt(x: float) -> float:
+    """0, or NaN of NaN: a row with one is NaN in all coordinates, as on the torch path."""
+    return x if np.isnan(x) else 0.0
+
+
+@numba.njit(inline="always", **OPTIONS)  # type: ignore[untyped-decorator]
+def first_root(b: Any, c: Any) -> Any:
+    """A Newton step from 0 towards the root s of s = exp(-(A s² - 2 B s + C)), held in [0, 1]."""
+    k = exp(c * -1.0)
+    slope = 1.0 - 2.0 * k * b
+    s = where(slope > 0.3, k / slope, 3.0 * k)
+    return where(s > 1.0, 1.0, s)
+
+
+@numba.njit(inline="always", **OPTIONS)  # type: ignore[untyped-decorator]
+def next_root(s: Any, low: Any, high: Any, a: Any, b: Any, c: Any) -> Any:
+    """A better s, its bracket, and whether yet another step would change it.
+
+    Halley's method, as two derivatives cost less than another exponential, inside a shrinking bracket. It is done
+    when a bound of the next step is lost in rounding.
+    """
+    g = b - a * s
+    exponent = (g + b) * s - c
+    k = exp(where(exponent > 0.0, 0.0, exponent))
+    gap = s - k
+    slope = 1.0 - 2.0 * g * k
+    bend = (a - 2.0 * g * g) * k
+    low = where(gap < 0.0, s, low)
+    high = where(gap > 0.0, s, high)
+    new = s - gap * slope / (slope * slope - gap * bend)
+    outside = either(new < low, new > high)
+    new = where(outside, 0.5 * (low + high), new)
+    step = new - s
+    step = where(step < 0.0, -1.0 * step, step)
+    still = either(outside, step * step * step * (bend * bend + slope) > 2e-16 * new * slope * slope)
+    return new, low, high, still
+
+
+@cache
+def pack_kernel() -> Any:
+    return compiled(pack, "float64[:, ::1](float64[:, ::1], float64[::1], float64[:, ::1])")
+
+
+def pack(centers: Array, log_widths: Array, strengths: Array) -> Array:
+    count, dim = centers.shape
+    layers = np.empty((count, 2 * dim + 2))
+    for j in range(count):
+        width = np.exp(log_widths[j])
+        squared = 0.0
+        for d in range(dim):
+            squared += strengths[j, d] ** 2
+        scale = np.sqrt(np.e / 2 / (1 + squared)) / width
+        for d in range(dim):
+            layers[j, d] = centers[j, d]
+            layers[j, dim + d] = scale * strengths[j, d]
+        layers[j, 2 * dim] = width * width
+        layers[j, 2 * dim + 1] = np.e / 2 * squared / (1 + squared)
+    return layers
+
+
+@cache
+def forward_kernel(dim: int, tangents: int, block: int) -> Any:
+    """ψ of points, and J_ψ of so many tangents at each: x (m, n) and t (m, n·T) or (1, n·T) -> x, t."""
+    width = WIDTH if block > 1 else 1
+    first_tangent = (dim + 1) * block
+
+    def sweep(layers: Array, x: Array, t: Array, x_out: Array, t_out: Array) -> None:
+        held = np.empty((1 + dim + dim * tangents) * block)  # squared distance; coordinates; tangents
+        near = np.empty(block, np.int64)
+        for begin in range(0, len(x), block):
+            count = min(block, len(x) - begin)
+            padded = (count + width - 1) // width * width
+            for i in range(padded):
+                row = begin + min(i, count - 1)
+                for d in range(dim):
+                    held[(d + 1) * block + i] = x[row, d]
+                for e in range(dim * tangents):
+                    held[first_tangent + e * block + i] = t[min(row, len(t) - 1), e]
+            for j in range(len(layers)):
+                q = layers[j, 2 * dim]
+                far = NEGLIGIBLE / q
+                n_near = 0
+                for u in range(0, padded, width):
+                    w = load(held, block + u, width) - layers[j, 0]
+                    distance = w * w
+                    for d in range(1, dim):
+                        w = load(held, (d + 1) * block + u, width) - layers[j, d]
+                        distance = distance + w * w
+                    store(held, u, distance)
+                    near[n_near] = u
+                    n_near += anywhere(distance < far)
+                for i in range(n_near):
+                    u = near[i]
+                    k = exp(load(held, u, width) * -q)
+                    for e in range(tangents):
+                        along = (load(held, block + u, width) - layers[j, 0]) * load(
+                            held, first_tangent + e * block + u, width
+                        )
+                        for d in range(1, dim):
+                            w = load(held, (d + 1) * block + u, width) - layers[j, d]
+                            along = along + w * load(held, first_tangent + (d * tangents + e) * block + u, width)
+                        along = where(k > 0.0, -2.0 * q * k * along, k)  # 0·inf is not a number
+                        for d in range(dim):
+                            place = first_tangent + (d * tangents + e) * block + u
+                            store(held, place, load(held, place, width) + along * layers[j, dim + d])
+                    for d in range(dim):
+                        place = (d + 1) * block + u
+                        store(held, place, load(held, place, width) + k * layers[j, dim + d])
+            for i in range(count):
+                doubt = 0.0  # or not a number, as soon as one coordinate is
+                for d in range(dim):
+                    doubt += _doubt(held[(d + 1) * block + i])
+                for d in range(dim):
+                    x_out[begin + i, d] = held[(d + 1) * block + i] + doubt
+                for e in range(dim * tangents):
+                    t_out[begin + i, e] = held[first_tangent + e * block + i] + doubt
+
+    return compiled(sweep, _signature(5))
+
+
+@cache
+def inverse_kernel(dim: int, block: int) -> Any:
+    """ψ⁻¹ of points: (m, n) -> (m, n).
+
+    Each layer is one root of s = exp(-(A s² - 2 B s + C)) in [0, 1], A = ρ²‖v‖², B = ρ² v·(y-c), C = ρ²‖y-c‖². Vectors
+    of points whose roots are found drop out of the iteration.
+    """
+    width = WIDTH if block > 1 else 1
+    at_b, at_s, at_low, at_high, at_x = (row * block for row in range(1, 6))
+
+    def inverse(layers: Array, y: Array, x_out: Array) -> None:
+        held = np.empty((5 + dim) * block)  # C; B; s; its bracket; coordinates
+        near = np.empty(block, np.int64)
+        for begin in range(0, len(y), block):
+            count = min(block, len(y) - begin)
+            padded = (count + width - 1) // width * width
+            for i in range(padded):
+                for d in range(dim):
+                    held[at_x + d * block + i] = y[begin + min(i, count - 1), d]
+            for j in range(len(layers) - 1, -1, -1):
+                q, a = layers[j, 2 * dim], layers[j, 2 * dim + 1]
+                n_near = 0
+                for u in range(0, padded, width):
+                    w = load(held, at_x + u, width) - layers[j, 0]
+                    c = w * w
+                    b = w * layers[j, dim]
+                    for d in range(1, dim):
+                        w = load(held, at_x + d * block + u, width) - layers[j, d]
+                        c = c + w * w
+                        b = b + w * layers[j, dim + d]
+                    c = c * q
+                    store(held, u, c)
+                    store(held, at_b + u, b * q)
+                    near[n_near] = u
+                    n_near += anywhere(c < BEYOND)
+                for i in range(n_near):
+                    u = near[i]
+                    s = first_root(load(held, at_b + u, width), load(held, u, width))
+                    store(held, at_s + u, s)
+                    store(held, at_low + u, s * 0.0)
+                    store(held, at_high + u, s * 0.0 + 1.0)
+                n_open = n_near
+                for _ in range(64):
+                    n_left = 0
+                    for i in range(n_open):
+                        u = near[i]
+                        s, low, high, still = next_root(
+                            load(held, at_s + u, width),
+                            load(held, at_low + u, width),
+                            load(held, at_high + u, width),
+                            a,
+                            load(held, at_b + u, width),
+                            load(held, u, width),
+                        )
+                        store(held, at_s + u, s)
+                        store(held, at_low + u, low)
+                        store(held, at_high + u, high)
+                        near[i], near[n_left] = near[n_left], u
+                        n_left += anywhere(still)
+                    n_open = n_left
+                    if n_open == 0:
+                        break
+                for i in range(n_near):
+                    u = near[i]
+                    s = where(load(held, u, width) > 720.0, 0.0, load(held, at_s + u, width))
+                    for d in range(dim):
+                        place = at_x + d * block + u
+                        store(held, place, load(held, place, width) - s * layers[j, dim + d])
+            for i in range(count):
+                doubt = 0.0
+                for d in range(dim):
+                    doubt += _doubt(held[at_x + d * block + i])
+                for d in range(dim):
+                    x_out[begin + i, d] = held[at_x + d * block + i] + doubt
+
+    return compiled(inverse, _signature(3))
+
+
+def _signature(n_arrays: int) -> str:
+    return f"void({', '.join(['float64[:, ::1]'] * n_arrays)})"
