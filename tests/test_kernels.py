@@ -8,6 +8,10 @@ import math
 import multiprocessing
 import os
 import pickle
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numba
 import numpy as np
@@ -360,6 +364,32 @@ def test_compiling_where_no_cache_can_be_kept(monkeypatch, capsys):
 
     assert compiling.compiled(twice, "float64(float64)")(1.5) == 3.0
     assert capsys.readouterr().err == "latentds: compiled twice for this CPU in 5.0 s\n"
+
+
+def test_an_edit_of_what_a_kernel_inlines_compiles_it_anew(tmp_path):
+    shutil.copytree(
+        Path(compiling.__file__).parents[1], tmp_path / "latentds", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    code = (
+        "import numpy as np; from latentds.kernels.compiling import compiled; from latentds.kernels.lanes import exp;"
+        "from latentds.kernels import translations;"
+        "kernel = compiled(lambda x: exp(x), 'float64(float64)');"
+        "print(kernel(-2.0), sum(translations.pack_kernel().stats.cache_hits.values()))"
+    )
+
+    def run():
+        found = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+        value, hits = found.stdout.split()
+        return float(value), int(hits)
+
+    assert run() == (pytest.approx(math.exp(-2)), 0)
+    assert run()[1] == 1
+    lanes_file = tmp_path / "latentds" / "kernels" / "lanes.py"
+    before = lanes_file.stat()
+    lanes_file.write_text(lanes_file.read_text().replace("where(x > -650.0", "where(x > -1.0"))
+    os.utime(lanes_file, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert run() == (0.0, 0)
+    assert run() == (0.0, 1)
 
 
 def test_warmup_compiles_everything(capsys):

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
+import inspect
 import sys
 import time
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -17,11 +21,23 @@ def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:
-            return numba.njit(cache=True, **options)(function)
+            kernel = numba.njit(cache=True, **options)(function)
         except RuntimeError:
             return numba.njit(**options)(function)
+        # Numba asks only for the age of the file that defines a function; ours inline each other across files.
+        kernel._cache._cache_file._source_stamp = _sources(inspect.getfile(function))
+        return kernel
 
     return decorate
+
+
+@cache
+def _sources(file: str) -> str:
+    """A hash of what machine code made from a file depends on: its content, and that of this package."""
+    digest = hashlib.sha256()
+    for path in sorted({Path(file), *Path(__file__).parent.glob("*.py")}):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def compiled(function: Callable[..., Any], signature: str) -> Any:
