@@ -14,9 +14,10 @@ from torch import Tensor, nn
 from latentds.arguments import whole_number
 from latentds.base import FitReport, LatentDS
 from latentds.demonstration import Demonstration, demonstrations_of
-from latentds.diffeomorphism import AffineCouplings
-from latentds.time_law import LatentDynamics
-from latentds.training import Plan, Training, descend
+from latentds.dynamics import LatentDynamics
+
+from .couplings import AffineCouplings
+from .training import Plan, Training, descend
 
 PLANS = {
     "official": Plan(epochs=5000, learning_rate=1e-4, weight_decay=1e-10, clip=0.1, patience=250),
@@ -182,7 +183,7 @@ class NormalizedDescent(LatentDynamics):
         states: Tensor = self.attractor + later.unsqueeze(-1) * direction
         return states
 
-    def slowest_rate(self, radius: float) -> float:
+    def convergence_rate_bound(self, radius: float) -> float:
         slowest = float(torch.exp(self.log_speed_range[0]) / self.duration)
         return slowest / max(radius, GUARD * float(self.length))
 

@@ -33,12 +33,13 @@ from rich.progress import track
 from baselines import FDM
 from experiments import report
 from experiments.spirals import CHEBYSHEV, STABLE, STRAIGHT, spirals
-from latentds import ChebyshevDS, Demonstration, datasets, kernels, metrics, plotting, tube
+from latentds import ChebyshevDS, Demonstration, datasets, kernels, metrics, plotting
 from latentds.base import LatentDS
 from latentds.benchmark import Cell, Factory, Protocol, evaluate
-from latentds.matching import PINS
+from latentds.fitting.matching import PINS
+from latentds.methods import tube
+from latentds.methods.tube import TubeDS
 from latentds.store import CellStore, fingerprint
-from latentds.tube import TubeDS
 
 PROTOCOL = Protocol()
 MANY = Protocol(n_starts=200)

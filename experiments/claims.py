@@ -15,8 +15,9 @@ from experiments.spirals import Setting
 from latentds import ChebyshevDS, Demonstration, datasets
 from latentds.base import LatentDS
 from latentds.benchmark import Cell
-from latentds.embedding import chebyshev_columns, chebyshev_eigenvalues, place
-from latentds.time_law import PiecewiseLinearLaw, RayDynamics, TubeDynamics
+from latentds.dynamics import RayDynamics, TubeDynamics
+from latentds.fitting.embedding import chebyshev_columns, chebyshev_eigenvalues, map_to_endpoints
+from latentds.time_law import PiecewiseLinearLaw
 
 Array = NDArray[np.float64]
 
@@ -43,7 +44,7 @@ def embedding(dims: Sequence[int] = DIMS, counts: Sequence[int] = COUNTS) -> pd.
             columns, eigenvalues = chebyshev_columns(count, n), chebyshev_eigenvalues(count, n)
             units = columns / np.linalg.norm(columns, axis=0)
             gaps = columns[:, :, None] - columns[:, None, :]
-            placed = place(columns, np.zeros(n), np.ones(n))
+            placed = map_to_endpoints(columns, np.zeros(n), np.ones(n))
             aside = placed - placed.mean(axis=1, keepdims=True)
             steps = np.diff(columns, axis=0)
             rows.append(
@@ -138,11 +139,11 @@ class Variant(LatentDS):
         dynamics.law = self.greedy.dynamics.law
         if isinstance(dynamics, TubeDynamics):
             rate = torch.tensor([self.contraction / demonstration.duration])
-            dynamics.pull = PiecewiseLinearLaw(torch.ones(1), rate)
+            dynamics.transverse_law = PiecewiseLinearLaw(torch.ones(1), rate)
         with torch.no_grad():
             # The latent line runs from the start to the goal themselves, so x_N is the goal.
             attractor = demonstration.goal if self.printed else self.encode(demonstration.goal)
-            dynamics.aim(self.encode(demonstration.start), attractor)
+            dynamics.set_endpoints(self.encode(demonstration.start), attractor)
             self.attractor.copy_(self.decode(attractor))
         return self
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from experiments.tuning import Tried
 from latentds import ChebyshevDS, Demonstration
 from latentds.base import StableDS
-from latentds.embedding import chebyshev_columns, place
+from latentds.fitting.embedding import chebyshev_columns, map_to_endpoints
 from latentds.plotting import SHOWN, color_of
 
 Array = NDArray[np.float64]
@@ -27,7 +27,7 @@ def framework(shown: Demonstration, ds: ChebyshevDS, n_nodes: int = 12) -> Figur
     """From a 3-D demonstration by K = 4 copies, their graph and the latent points to the mapped points."""
     points = shown.positions.numpy()
     columns = chebyshev_columns(len(shown), 3)[::-1]
-    latent = place(columns, points[0], points[-1])
+    latent = map_to_endpoints(columns, points[0], points[-1])
     with torch.no_grad():
         mapped = ds.decode(torch.from_numpy(latent)).numpy()
     figure = Figure(figsize=(13, 8), dpi=DPI, layout="constrained")

@@ -32,11 +32,11 @@ from baselines import SDSEF
 from experiments import report
 from latentds import ChebyshevDS, datasets, kernels
 from latentds.diffeomorphism import WIDTH_BOUND
-from latentds.embedding import chebyshev_columns, place
+from latentds.fitting.embedding import chebyshev_columns, map_to_endpoints
+from latentds.fitting.matching import match
 from latentds.kernels.compiling import OPTIONS
 from latentds.kernels.dispatch import BLOCK
 from latentds.kernels.lanes import WIDTH, exp, load, store
-from latentds.matching import match
 
 N_LAYERS = 150
 SHOWN = datasets.unstable_spiral(7)
@@ -305,7 +305,7 @@ def rollouts(ds: ChebyshevDS, rounds: int) -> list[Goal]:
 
 def fits(rounds: int) -> list[Goal]:
     y = SHOWN.positions.numpy()
-    x = place(chebyshev_columns(len(y), 3)[::-1], y[0], y[-1])
+    x = map_to_endpoints(chebyshev_columns(len(y), 3)[::-1], y[0], y[-1])
     slow: list[float] = []
     times = take_turns(
         {"fast": lambda: match(x, y, 300, 0.5, 0.9), "bounded": lambda: slow.append(loop_match(x, y, 300, 0.5, 0.9))},
@@ -384,7 +384,7 @@ def growth(quick: bool) -> pd.DataFrame:
     for count in (125, 250, 500, 1000, 2000, 4000, 8000):
         shown = datasets.unstable_spiral(7, count)
         points = shown.positions.numpy()
-        x = place(chebyshev_columns(count, 3)[::-1], points[0], points[-1])
+        x = map_to_endpoints(chebyshev_columns(count, 3)[::-1], points[0], points[-1])
         values = take_turns({"match": lambda x=x, p=points: match(x, p, N_LAYERS, 0.5, 0.9)}, 5)["match"]
         rows.append(("N", "match", count, float(np.median(values))))
     return pd.DataFrame(rows, columns=["grows", "call", "size", "seconds"])

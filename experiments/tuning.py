@@ -23,8 +23,8 @@ from baselines import SDSEF, sdsef
 from latentds import Demonstration
 from latentds.base import FitReport, StableDS
 from latentds.benchmark import Cell, Protocol, run
-from latentds.embedding import chebyshev_columns, place, straight_column
-from latentds.matching import advance
+from latentds.fitting.embedding import chebyshev_columns, map_to_endpoints, straight_column
+from latentds.fitting.matching import add_greedy_layers
 from latentds.metrics import mse
 from latentds.store import fingerprint
 
@@ -94,10 +94,10 @@ def choose(tried: Sequence[Tried]) -> Choice:
 def trace(method: str, shown: Demonstration, beta: float, mu: float, n_layers: Sequence[int]) -> list[float]:
     """The MSE per coordinate of a greedy match after each of ``n_layers`` layers, which increase."""
     target = shown.positions.numpy()
-    moved = place(COLUMNS[method](shown), target[0], target[-1])
+    moved = map_to_endpoints(COLUMNS[method](shown), target[0], target[-1])
     found, used = [], 0
     for count in n_layers:
-        moved = advance(moved, target, count - used, beta, mu)[1]
+        moved = add_greedy_layers(moved, target, count - used, beta, mu)[1]
         used = count
         found.append(float(np.square(moved - target).mean()))
     return found

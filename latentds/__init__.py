@@ -4,12 +4,12 @@ from . import datasets
 from .base import FitReport, LatentDS, StableDS
 from .benchmark import compare
 from .certificate import Certificate, certify
-from .chebyshev import ChebyshevDS
 from .demonstration import Demonstration
 from .diffeomorphism import Diffeomorphism, LocallyWeightedTranslations
 from .kernels import warmup
+from .methods.chebyshev import ChebyshevDS
+from .methods.tube import TubeDS
 from .storage import load
-from .tube import TubeDS
 
 __version__ = "0.1.0"
 __all__ = [

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import inspect
+import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from .arguments import check_points, real_tensor, whole_number
 from .demonstration import Demonstration
+from .deploy.controller import Controller
+from .deploy.tables import FieldTables, field_tables
 from .diffeomorphism import Diffeomorphism
-from .time_law import LatentDynamics
-
-if TYPE_CHECKING:
-    from .controller import Controller
+from .dynamics import LatentDynamics
 
 Self = TypeVar("Self", bound="StableDS")
 
@@ -88,9 +88,11 @@ class StableDS(nn.Module, ABC):
 
     def controller(self) -> Controller:
         """The velocity field as it is now for a real-time loop, NumPy in and out: see :class:`Controller`."""
-        from .controller import Controller
-
         return Controller(self)
+
+    def tables(self) -> FieldTables | None:
+        """The velocity field as plain arrays, for controllers and exporters; None where it cannot be written so."""
+        return None
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -155,6 +157,17 @@ class LatentDS(StableDS):
         """J_ψ at latent ``x``, in closed form: (..., n) -> (..., n, n)."""
         points, wanted = self._points(x, "x")
         return self.diffeomorphism.jacobian(points).to(wanted)
+
+    def condition_number(self, x: Tensor) -> Tensor:
+        """cond(J_ψ), the 2-norm's, at latent ``x``: (..., n) -> (...); inf where J_ψ is not finite."""
+        jacobians = self.jacobian(x)
+        finite = torch.isfinite(jacobians).all(-1).all(-1)
+        safe = torch.where(finite[..., None, None], jacobians, torch.eye(self.dim).to(jacobians))
+        return torch.where(finite, torch.linalg.cond(safe), math.inf)
+
+    def tables(self) -> FieldTables | None:
+        # A subclass whose velocity is another one must say itself how to write it.
+        return field_tables(self.diffeomorphism, self.dynamics) if type(self).forward is LatentDS.forward else None
 
     def forward(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)

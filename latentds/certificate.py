@@ -13,7 +13,6 @@ from torch import Tensor
 
 from .arguments import real_array, whole_number
 from .base import LatentDS, StableDS
-from .diffeomorphism import WIDTH_BOUND, AffineCouplings, LocallyWeightedTranslations
 
 Verdict = Literal["proven", "not falsified", "falsified"]
 
@@ -136,7 +135,7 @@ class _Search:
     def lines(self) -> list[Line]:
         found = [self._finite()]
         if isinstance(self.ds, LatentDS):
-            found += [*self._layers(self.ds), *self._rate(self.ds)]
+            found += [*self._invertibility(self.ds), *self._rate(self.ds)]
         found += [self._attractor()]
         if found[0].verdict == "falsified":
             return found
@@ -148,42 +147,19 @@ class _Search:
         broken = ~torch.isfinite(self.velocity).all(-1)
         return self._judge("velocities are finite", broken.to(self.goal), 0.5, "share that is not", self.points)
 
-    def _layers(self, ds: LatentDS) -> list[Line]:
-        psi = ds.diffeomorphism
-        if isinstance(psi, LocallyWeightedTranslations):
-            with torch.no_grad():
-                bound = psi.widths * torch.linalg.vector_norm(psi.directions, dim=-1) / WIDTH_BOUND
-            margins = torch.nan_to_num(torch.minimum(psi.margins.detach(), 1 - bound + 1e-12), nan=-math.inf)
-            worst = int(margins.argmin())
-            fold = None if margins[worst] > 0 else self._fold(psi, worst)
-            claim, detail = "every layer is invertible, ρ‖v‖√(2/e) < 1", "smallest margin"
-            return [_settled(claim, len(margins), float(margins[worst]), detail, fold)]
-        if isinstance(psi, AffineCouplings):
-            # Every coupling scales by exp(bounded): positive, whatever the finite parameters are.
-            finite = all(bool(torch.isfinite(part).all()) for part in psi.state_dict().values())
-            scale = float(psi.scale.min())
-            claim = "every coupling has a positive determinant"
-            return [_settled(claim, psi.n_layers, scale if finite else -math.inf, "least scale")]
-        return []
+    def _invertibility(self, ds: LatentDS) -> list[Line]:
+        told = ds.diffeomorphism.invertibility()
+        return [] if told is None else [_settled(told.claim, told.n_checked, told.margin, told.detail, told.fold)]
 
     def _rate(self, ds: LatentDS) -> list[Line]:
         with torch.no_grad():
             reach = torch.linalg.vector_norm(ds.encode(self.points) - ds.dynamics.attractor, dim=-1)
             radius = float(reach[torch.isfinite(reach)].max()) if bool(torch.isfinite(reach).any()) else 1.0
-            rate = ds.dynamics.slowest_rate(radius)
+            rate = ds.dynamics.convergence_rate_bound(radius)
         if rate is None:
             return []
         claim = "latent motions approach the goal, -V̇/2V >= rate > 0"
         return [_settled(claim, 1, rate, "least rate in the region, per second:")]
-
-    def _fold(self, psi: LocallyWeightedTranslations, index: int) -> tuple[float, ...]:
-        """Where a layer that breaks its bound folds space most."""
-        with torch.no_grad():
-            c, v, q = psi._layers()[index]
-            y = c + v / torch.linalg.vector_norm(v) / (2 * q).sqrt()
-            for c, v, q in psi._layers()[index:]:
-                y = y + torch.exp(-q * (y - c).square().sum(-1, keepdim=True)) * v
-        return tuple(y.tolist())
 
     def _attractor(self) -> Line:
         with torch.no_grad():

@@ -2,22 +2,36 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from .arguments import check_points, positive, whole_number
-from .coupling_kernels import Couplings
+from .arguments import check_points, whole_number
 from .kernels import translations
 
 WIDTH_BOUND = math.sqrt(math.e / 2)
 """A layer x + exp(-ρ²‖x-c‖²) v is invertible while ρ‖v‖ < √(e/2) (Perrin and Schlehuber-Caissier 2016)."""
+
+
+class Invertibility(NamedTuple):
+    """What makes a map invertible, checked on its parameters."""
+
+    claim: str
+    n_checked: int
+    """layers"""
+    margin: float
+    """the least of them; the claim holds while it is above 0"""
+    detail: str
+    """what the margin is"""
+    fold: tuple[float, ...] | None = None
+    """(n,) where the map folds space, if the claim is false"""
 
 
 class Diffeomorphism(nn.Module, ABC):
@@ -48,6 +62,26 @@ class Diffeomorphism(nn.Module, ABC):
     @abstractmethod
     def log_abs_det_jacobian(self, x: Tensor) -> Tensor:
         """log |det J_ψ(x)|: (..., n) -> (...)."""
+
+    def invertibility(self) -> Invertibility | None:
+        """What proves this map invertible for the parameters that it has now; None if nothing does."""
+        return None
+
+    def layer_table(self) -> NDArray[np.float64] | None:
+        """The map as the velocity kernel reads it, a row (c, v, ρ², ρ²‖v‖²) per layer (M, 2n+2); None if it cannot."""
+        return None
+
+
+def directions_of(strengths: Any, widths: Any, mu: float = 1.0) -> Any:
+    """v = μ√(e/2)/ρ · a/√(1+‖a‖²), so that ρ‖v‖√(2/e) < μ for every a: arrays or tensors (M, n), (M,) -> (M, n)."""
+    root = (1 + (strengths**2).sum(-1)[..., None]) ** 0.5
+    return mu * WIDTH_BOUND * strengths / root / widths[..., None]
+
+
+def strengths_of(directions: Any, widths: Any, mu: float = 1.0) -> Any:
+    """The inverse of :func:`directions_of` in a, for directions within the bound."""
+    bounded = widths[..., None] * directions / (mu * WIDTH_BOUND)
+    return bounded / (1 - (bounded**2).sum(-1)[..., None]) ** 0.5
 
 
 class Layers(NamedTuple):
@@ -96,8 +130,8 @@ class LocallyWeightedTranslations(Diffeomorphism):
     @property
     def directions(self) -> Tensor:
         """v, (M, n), in units of length."""
-        bounded = self.strengths / (1 + self.strengths.square().sum(-1, keepdim=True)).sqrt()
-        return WIDTH_BOUND * torch.exp(-self.log_widths).unsqueeze(-1) * bounded
+        found: Tensor = directions_of(self.strengths, self.widths)
+        return found
 
     @property
     def margins(self) -> Tensor:
@@ -119,15 +153,14 @@ class LocallyWeightedTranslations(Diffeomorphism):
             ValueError: if a layer breaks the invertibility bound.
         """
         used = len(centers)
-        bounded = widths.unsqueeze(-1) * directions / WIDTH_BOUND
-        squared = bounded.square().sum(-1, keepdim=True)
+        squared = (widths.unsqueeze(-1) * directions / WIDTH_BOUND).square().sum(-1)
         if used > self.n_layers or not bool((squared < 1).all()) or not bool((widths > 0).all()):
             raise ValueError(
                 f"layers: expected at most {self.n_layers} with widths > 0 and ρ‖v‖√(2/e) < 1, got {used} "
                 f"with largest bound {float(squared.max().sqrt()) if used else 0.0:g}"
             )
         self.centers.zero_()[:used] = centers.to(self.centers)
-        self.strengths.zero_()[:used] = (bounded / (1 - squared).sqrt()).to(self.strengths)
+        self.strengths.zero_()[:used] = strengths_of(directions, widths).to(self.strengths)
         self.log_widths.zero_()[:used] = widths.log().to(self.log_widths)
         self.log_widths[used:] = self.log_widths[:used].mean() if used else 0.0
 
@@ -187,6 +220,28 @@ class LocallyWeightedTranslations(Diffeomorphism):
             x = x + k * v
         return total
 
+    @torch.no_grad()
+    def invertibility(self) -> Invertibility:
+        bound = self.widths * torch.linalg.vector_norm(self.directions, dim=-1) / WIDTH_BOUND
+        margins = torch.nan_to_num(torch.minimum(self.margins, 1 - bound + 1e-12), nan=-math.inf)
+        worst = int(margins.argmin())
+        fold = None if margins[worst] > 0 else self._fold(worst)
+        claim, detail = "every layer is invertible, ρ‖v‖√(2/e) < 1", "smallest margin"
+        return Invertibility(claim, len(margins), float(margins[worst]), detail, fold)
+
+    def layer_table(self) -> NDArray[np.float64] | None:
+        if type(self) is not LocallyWeightedTranslations:
+            return None
+        return translations.layers_of(copy.deepcopy(self).to("cpu", torch.float64))
+
+    def _fold(self, index: int) -> tuple[float, ...]:
+        """Where a layer that breaks its bound folds space most."""
+        c, v, q = self._layers()[index]
+        y = c + v / torch.linalg.vector_norm(v) / (2 * q).sqrt()
+        for c, v, q in self._layers()[index:]:
+            y = y + torch.exp(-q * (y - c).square().sum(-1, keepdim=True)) * v
+        return tuple(y.tolist())
+
     def _layers(self) -> list[tuple[Tensor, Tensor, Tensor]]:
         """(c, v, ρ²) of every layer, first to last."""
         squares = torch.exp(2 * self.log_widths)
@@ -235,172 +290,3 @@ def _everywhere(done: Tensor) -> bool:
         return bool(done.all())
     except RuntimeError:
         return False
-
-
-class AffineCouplings(Diffeomorphism):
-    """ψ = φ⁻¹ with φ a composition of affine couplings of random Fourier features (Rana et al. 2020, Sec. IV).
-
-    φ normalises, u = (y - center) / scale, and parts u into its even and its odd coordinates; layer by layer one part
-    p moves the other, q ← q ∘ exp(s(p)) + t(p), in turns. Log-scale s and shift t are A cos(W p + b) with frozen
-    W ~ N(0, 1) / sigma and b ~ U(0, 2π). A = 0, the start, is the identity. For n = 1 there are no two parts, and φ
-    is a learned affine map.
-
-    Args:
-        dim: n >= 1.
-        n_layers: L >= 1.
-        n_features: F >= 1, cosines in each s and in each t.
-        sigma: bandwidth of the features, > 0, in normalised units.
-        generator: draws W and b (torch's global one if None).
-
-    Attributes:
-        center, scale: (n,) buffers, units of y; scale > 0.
-    """
-
-    center: Tensor
-    scale: Tensor
-    _order: Tensor
-
-    def __init__(
-        self,
-        dim: int,
-        n_layers: int,
-        n_features: int,
-        *,
-        sigma: float = 0.45,
-        generator: torch.Generator | None = None,
-    ) -> None:
-        super().__init__()
-        self.dim = whole_number(dim, "dim", at_least=1)
-        self.n_layers = whole_number(n_layers, "n_layers", at_least=1)
-        self.n_features = whole_number(n_features, "n_features", at_least=1)
-        parts = torch.arange(0, dim, 2), torch.arange(1, dim, 2)
-        self.layers = nn.ModuleList(
-            _Coupling(len(parts[j % 2]), len(parts[(j + 1) % 2]), n_features, positive(sigma, "sigma"), generator)
-            for j in range(n_layers)
-        )
-        self.register_buffer("center", torch.zeros(dim, dtype=torch.float64))
-        self.register_buffer("scale", torch.ones(dim, dtype=torch.float64))
-        self.register_buffer("_order", torch.cat(parts).argsort(), persistent=False)
-
-    def extra_repr(self) -> str:
-        return f"dim={self.dim}, n_layers={self.n_layers}, n_features={self.n_features}"
-
-    def forward(self, x: Tensor) -> Tensor:
-        check_points(self.dim, x, "x")
-        parts = [x[..., 0::2], x[..., 1::2]]
-        for source, layer in reversed(self._couplings()):
-            log_scale, shift = layer(parts[source])
-            parts[1 - source] = (parts[1 - source] - shift) * torch.exp(-log_scale)
-        return self._join(parts) * self.scale + self.center
-
-    def inverse(self, y: Tensor) -> Tensor:
-        u = self.normalize(y)
-        parts = [u[..., 0::2], u[..., 1::2]]
-        for source, layer in self._couplings():
-            log_scale, shift = layer(parts[source])
-            parts[1 - source] = parts[1 - source] * torch.exp(log_scale) + shift
-        return self._join(parts)
-
-    def linearize(self, y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-        """As declared; the map also takes a stack of tangents at once, (..., *y.shape)."""
-        u = self.normalize(y)
-        parts = [u[..., 0::2], u[..., 1::2]]
-        steps = []
-        for source, layer in self._couplings():
-            log_scale, shift, log_scale_slope, shift_slope = layer.with_slopes(parts[source])
-            grown = parts[1 - source] * torch.exp(log_scale)
-            steps.append((source, torch.exp(-log_scale), grown.unsqueeze(-1) * log_scale_slope + shift_slope))
-            parts[1 - source] = grown + shift
-
-        def push(tangent: Tensor) -> Tensor:
-            parts = [tangent[..., 0::2], tangent[..., 1::2]]
-            for source, shrink, slope in reversed(steps):
-                sheared = (slope * parts[source].unsqueeze(-2)).sum(-1)
-                parts[1 - source] = (parts[1 - source] - sheared) * shrink
-            return self._join(parts) * self.scale
-
-        return self._join(parts), push
-
-    def compiled_linearize(self) -> Callable[[Tensor], tuple[Tensor, Callable[[Tensor], Tensor]]]:
-        """:meth:`linearize` for training on the CPU in float32: several times faster, differentiable once.
-
-        Takes (N, n) points. Reads the frozen features now, the amplitudes and the normalisation at every call.
-        """
-        layers = [layer for _, layer in self._couplings()]
-        compiled = Couplings([layer.frequencies for layer in layers], [layer.phases for layer in layers])
-
-        def linearize(y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-            x, push = compiled.linearize(self.normalize(y), [layer.amplitudes for layer in layers])
-            return x, lambda tangent: push(tangent) * self.scale
-
-        return linearize
-
-    def jacobian(self, x: Tensor) -> Tensor:
-        _, push = self.linearize(self(x))
-        axes = torch.eye(self.dim, dtype=x.dtype, device=x.device)
-        return push(axes.view(self.dim, *[1] * (x.ndim - 1), self.dim).expand(self.dim, *x.shape)).movedim(0, -1)
-
-    def log_abs_det_jacobian(self, x: Tensor) -> Tensor:
-        check_points(self.dim, x, "x")
-        parts = [x[..., 0::2], x[..., 1::2]]
-        total = self.scale.log().sum().expand(x.shape[:-1])
-        for source, layer in reversed(self._couplings()):
-            log_scale, shift = layer(parts[source])
-            parts[1 - source] = (parts[1 - source] - shift) * torch.exp(-log_scale)
-            total = total - log_scale.sum(-1)
-        return total
-
-    def normalize(self, y: Tensor) -> Tensor:
-        """(y - center) / scale: (..., n) -> (..., n)."""
-        check_points(self.dim, y, "y")
-        return (y - self.center) / self.scale
-
-    def _couplings(self) -> list[tuple[int, _Coupling]]:
-        """Every layer with the part that it reads: 0, the even coordinates, or 1."""
-        return [(j % 2, cast("_Coupling", layer)) for j, layer in enumerate(self.layers)]
-
-    def _join(self, parts: list[Tensor]) -> Tensor:
-        return torch.cat(parts, -1)[..., self._order]
-
-
-class _Coupling(nn.Module):
-    """Log-scale and shift of one coupling, and their slopes, as functions of the part p that it reads."""
-
-    frequencies: Tensor
-    phases: Tensor
-
-    def __init__(
-        self, n_read: int, n_moved: int, n_features: int, sigma: float, generator: torch.Generator | None
-    ) -> None:
-        super().__init__()
-        frequencies = torch.randn(2, n_features, n_read, dtype=torch.float64, generator=generator) / sigma
-        phases = 2 * math.pi * torch.rand(2, n_features, dtype=torch.float64, generator=generator)
-        self.register_buffer("frequencies", frequencies)
-        self.register_buffer("phases", phases)
-        self.amplitudes = nn.Parameter(torch.zeros(2, n_moved, n_features, dtype=torch.float64))
-
-    def forward(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        """s(p), t(p): (..., a) -> (..., b) each."""
-        cosines = torch.cos(self._angles(p))
-        half = cosines.shape[-1] // 2
-        return cosines[..., :half] @ self.amplitudes[0].mT, cosines[..., half:] @ self.amplitudes[1].mT
-
-    def with_slopes(self, p: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """s, t and ds/dp, dt/dp: (..., a) -> (..., b), (..., b), (..., b, a), (..., b, a)."""
-        angles = self._angles(p)
-        cosines, sines = torch.cos(angles), torch.sin(angles)
-        half = angles.shape[-1] // 2
-        # ds_i/dp_k = -Σ_f A_if W_fk sin_f: one product of the sines with the (b a, F) matrix of the A_if W_fk
-        slopes = -self.amplitudes.unsqueeze(-2) * self.frequencies.mT.unsqueeze(-3)
-        shape = (*p.shape[:-1], *slopes.shape[1:3])
-        rows = slopes.flatten(1, 2)
-        return (
-            cosines[..., :half] @ self.amplitudes[0].mT,
-            cosines[..., half:] @ self.amplitudes[1].mT,
-            (sines[..., :half] @ rows[0].mT).reshape(shape),
-            (sines[..., half:] @ rows[1].mT).reshape(shape),
-        )
-
-    def _angles(self, p: Tensor) -> Tensor:
-        """W p + b of the log-scale, then of the shift: (..., a) -> (..., 2 F)."""
-        return p @ self.frequencies.flatten(0, 1).mT + self.phases.flatten()

@@ -14,9 +14,9 @@ from typing import Any
 import torch
 
 from .base import FitReport, StableDS
-from .chebyshev import ChebyshevDS
 from .demonstration import atomic_write
-from .tube import TubeDS
+from .methods.chebyshev import ChebyshevDS
+from .methods.tube import TubeDS
 
 FORMAT = 1
 """Raised when files change so that an older latentds would misread them."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from .arguments import positive
@@ -36,8 +37,12 @@ class TimeLaw(nn.Module, ABC):
         """The inverse of :meth:`time_to_go`."""
 
     @abstractmethod
-    def slowest_rate(self, reach: float) -> float:
+    def convergence_rate_bound(self, reach: float) -> float:
         """The least h(s)/s over 0 < s <= ``reach``, per second."""
+
+    def table(self) -> NDArray[np.float64] | None:
+        """The law as compiled code reads it, (2, m): knots and speeds, or the knot -1 and ω; None if it cannot."""
+        return None
 
 
 class ChebyshevLaw(TimeLaw):
@@ -77,8 +82,11 @@ class ChebyshevLaw(TimeLaw):
         tail = TAIL * torch.exp(self._tail_rate * phase.clamp(max=0.0))
         return torch.where(phase < 0, tail, arc + (phase - top).clamp(min=0))
 
-    def slowest_rate(self, reach: float) -> float:
+    def convergence_rate_bound(self, reach: float) -> float:
         return float(self.speed(self.omega.new_tensor(reach))) / reach  # h(s)/s never rises
+
+    def table(self) -> NDArray[np.float64] | None:
+        return np.array([[-1.0], [float(self.omega)]]) if type(self) is ChebyshevLaw else None
 
 
 class PiecewiseLinearLaw(TimeLaw):
@@ -164,10 +172,15 @@ class PiecewiseLinearLaw(TimeLaw):
         tail = self.knots[0] * torch.exp(self.speeds[0] / self.knots[0] * time.clamp(max=0.0))
         return torch.where(index == 0, tail, inside)
 
-    def slowest_rate(self, reach: float) -> float:
+    def convergence_rate_bound(self, reach: float) -> float:
         # h(s)/s is monotone between two knots
         ends = torch.cat([self.knots[self.knots < reach], self.knots.new_tensor([reach])])
         return float((self.speed(ends) / ends).min())
+
+    def table(self) -> NDArray[np.float64] | None:
+        if type(self) is not PiecewiseLinearLaw:
+            return None
+        return torch.stack([self.knots, self.speeds]).detach().to("cpu", torch.float64, copy=True).numpy()
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         """A fit chooses how many knots there are, so a fresh law takes any number."""
@@ -219,125 +232,3 @@ def _travel(time: Tensor, speed: Tensor, slope: Tensor) -> Tensor:
     near = growth.abs() < 1e-6
     factor = torch.expm1(torch.where(near, 1.0, growth)) / torch.where(near, 1.0, growth)
     return speed * time * torch.where(near, 1 + growth / 2 + growth.square() / 6, factor)
-
-
-class LatentDynamics(nn.Module, ABC):
-    """ẋ = g(x), globally asymptotically stable at ``attractor``; ‖x - x*‖² decreases along every motion."""
-
-    attractor: Tensor
-
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        self.register_buffer("attractor", torch.zeros(dim, dtype=torch.float64))
-
-    @abstractmethod
-    def forward(self, x: Tensor, y: Tensor) -> Tensor:
-        """ẋ at x: (..., n) -> (..., n). ``y`` = ψ(x) is given for dynamics whose speed is a function of it."""
-
-    @abstractmethod
-    def flow(self, x: Tensor, t: Tensor) -> Tensor:
-        """States at times ``t`` (T,), seconds since x: (..., n) -> (..., T, n)."""
-
-    def lyapunov(self, x: Tensor) -> Tensor:
-        """V = ‖x - x*‖²: (..., n) -> (...)."""
-        return (x - self.attractor).square().sum(-1)
-
-    def slowest_rate(self, radius: float) -> float | None:
-        """A lower bound on -V̇/(2V) within ``radius`` of x*, per second, that holds by construction; None if unknown."""
-        return None
-
-
-class RayDynamics(LatentDynamics):
-    """Straight to the goal: the direction of x - x* stays, its length over ``length`` follows ``law``.
-
-    The paper's isotropic case. Attributes: ``length``, the distance of the demonstrated start from x*, > 0.
-    """
-
-    length: Tensor
-
-    def __init__(self, dim: int, law: TimeLaw) -> None:
-        super().__init__(dim)
-        self.law = law
-        self.register_buffer("length", torch.ones((), dtype=torch.float64))
-
-    def aim(self, start: Tensor, attractor: Tensor) -> None:
-        """Set where the demonstration starts and ends in latent space, both (n,)."""
-        self.attractor.copy_(attractor)
-        self.length.copy_(torch.linalg.vector_norm(start.to(torch.float64) - attractor.to(torch.float64)))
-
-    def forward(self, x: Tensor, y: Tensor) -> Tensor:
-        offset = x - self.attractor
-        s = _off_zero(offset / self.length)
-        return -(self.law.speed(s) / s) * offset
-
-    def flow(self, x: Tensor, t: Tensor) -> Tensor:
-        offset = (x - self.attractor).unsqueeze(-2)
-        return self.attractor + _shrink(self.law, _off_zero(offset / self.length), t) * offset
-
-    def slowest_rate(self, radius: float) -> float:
-        return self.law.slowest_rate(radius / float(self.length))
-
-
-class TubeDynamics(LatentDynamics):
-    """Along the axis to the goal by ``law``, and across it inward at ``rate``: ṡ = -h(s), h odd, and ṗ = -κp.
-
-    With u the axis from x* to the demonstrated start and ``length`` their distance, s = u·(x - x*)/length and p is the
-    rest. Beyond ``radius`` from the axis the pull is held at κ·radius, so that a far start makes no wild speed.
-
-    Attributes:
-        axis: u, (n,).
-        length: distance of the demonstrated start from x*, > 0.
-    """
-
-    axis: Tensor
-    length: Tensor
-
-    def __init__(self, dim: int, law: TimeLaw, pull: TimeLaw) -> None:
-        super().__init__(dim)
-        self.law = law
-        self.pull = pull
-        self.register_buffer("axis", torch.eye(dim, dtype=torch.float64)[0])
-        self.register_buffer("length", torch.ones((), dtype=torch.float64))
-
-    def aim(self, start: Tensor, attractor: Tensor) -> None:
-        """Set where the demonstration starts and ends in latent space, both (n,)."""
-        self.attractor.copy_(attractor)
-        offset = start.to(torch.float64) - attractor.to(torch.float64)
-        self.length.copy_(torch.linalg.vector_norm(offset))
-        self.axis.copy_(offset / torch.linalg.vector_norm(offset))
-
-    def forward(self, x: Tensor, y: Tensor) -> Tensor:
-        along, across = self._split(x)
-        s, p = _off_zero(along), _off_zero(across)
-        inward = self.law.speed(s) / s * along * self.axis + self.pull.speed(p) / p * across
-        return -self.length * inward
-
-    def flow(self, x: Tensor, t: Tensor) -> Tensor:
-        along, across = (part.unsqueeze(-2) for part in self._split(x))
-        left = _shrink(self.law, _off_zero(along), t) * along * self.axis
-        return self.attractor + self.length * (left + _shrink(self.pull, _off_zero(across), t) * across)
-
-    def slowest_rate(self, radius: float) -> float:
-        reach = radius / float(self.length)
-        return min(self.law.slowest_rate(reach), self.pull.slowest_rate(reach))
-
-    def progress(self, x: Tensor) -> Tensor:
-        """s, 1 at the demonstrated start and 0 at x*: (..., n) -> (...)."""
-        return self._split(x)[0].squeeze(-1)
-
-    def _split(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Offset from x* in units of length: along the axis (..., 1) and across it (..., n)."""
-        offset = (x - self.attractor) / self.length
-        along = (offset * self.axis).sum(-1, keepdim=True)
-        return along, offset - along * self.axis
-
-
-def _shrink(law: TimeLaw, s: Tensor, t: Tensor) -> Tensor:
-    """What is left after ``t`` (T,) of the length s (..., 1, 1): the ratio, (..., T, 1)."""
-    return law.progress_at(law.time_to_go(s) - t.unsqueeze(-1)) / s
-
-
-def _off_zero(offset: Tensor) -> Tensor:
-    """Length of (..., n) as (..., 1), held off zero far inside the linear tail, where h(s)/s no longer changes."""
-    floor: float = torch.finfo(offset.dtype).tiny ** 0.25
-    return (offset.square().sum(-1, keepdim=True) + floor**2).sqrt()

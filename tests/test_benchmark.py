@@ -12,7 +12,7 @@ from baselines import FDM
 from latentds import ChebyshevDS, Demonstration, StableDS, datasets, metrics
 from latentds.base import FitReport
 from latentds.benchmark import COLUMNS, Cell, Protocol, compare, run
-from latentds.matching import PINS
+from latentds.fitting.matching import PINS
 
 SPIRAL = datasets.unstable_spiral(1, 60)
 TIMES = ["fit_seconds", "rollout_seconds"]

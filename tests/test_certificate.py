@@ -12,8 +12,9 @@ import torch
 import baselines.sdsef
 from baselines import FDM, SDSEF
 from latentds import ChebyshevDS, LatentDS, LocallyWeightedTranslations, TubeDS, certify
+from latentds.dynamics import RayDynamics
 from latentds.testing import wavy_motion
-from latentds.time_law import PiecewiseLinearLaw, RayDynamics
+from latentds.time_law import PiecewiseLinearLaw
 
 METHODS = {
     "ChebyshevDS": lambda dim: ChebyshevDS(dim, n_layers=60),
@@ -50,7 +51,7 @@ class Sound(LatentDS):
             psi.centers.normal_(generator=draw)
             psi.strengths.normal_(generator=draw)
             self.attractor[0] = 1
-            self.dynamics.aim(psi.inverse(-self.attractor), psi.inverse(self.attractor))
+            self.dynamics.set_endpoints(psi.inverse(-self.attractor), psi.inverse(self.attractor))
 
     def fit(self, demonstration, *, progress=False):
         return self

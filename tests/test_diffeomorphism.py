@@ -9,8 +9,9 @@ import pytest
 import torch
 from scipy.optimize import brentq
 
+from baselines.couplings import AffineCouplings
 from latentds import LocallyWeightedTranslations
-from latentds.diffeomorphism import WIDTH_BOUND, AffineCouplings
+from latentds.diffeomorphism import WIDTH_BOUND
 
 
 def random_psi(dim, n_layers=12, strength=1.0, seed=3):

@@ -11,8 +11,9 @@ from torch import nn
 
 from latentds import FitReport, LatentDS, LocallyWeightedTranslations, StableDS
 from latentds.demonstration import only_demonstration
+from latentds.dynamics import RayDynamics
 from latentds.testing import check_stable_ds, wavy_motion
-from latentds.time_law import PiecewiseLinearLaw, RayDynamics
+from latentds.time_law import PiecewiseLinearLaw
 
 
 class Plain(StableDS):
@@ -60,7 +61,7 @@ class Latent(LatentDS):
         psi.assign(centers, torch.full_like(centers, 0.1 * shown.size), torch.full((2,), 1.5 / shown.size))
         self.attractor.copy_(shown.goal)
         with torch.no_grad():
-            self.dynamics.aim(psi.inverse(shown.start), psi.inverse(shown.goal))
+            self.dynamics.set_endpoints(psi.inverse(shown.start), psi.inverse(shown.goal))
         self.fit_report = FitReport(0.0, 2, 0.0)
         return self
 

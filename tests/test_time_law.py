@@ -9,7 +9,8 @@ import pytest
 import torch
 from scipy.integrate import quad, solve_ivp
 
-from latentds.time_law import TAIL, ChebyshevLaw, PiecewiseLinearLaw, RayDynamics
+from latentds.dynamics import RayDynamics
+from latentds.time_law import TAIL, ChebyshevLaw, PiecewiseLinearLaw
 
 
 def random_law(seed, n_knots):
@@ -108,7 +109,7 @@ def test_a_law_that_breaks_its_own_rules_does_not_load():
 def test_rays_go_straight_to_the_goal(law, dim, draw):
     dynamics = RayDynamics(dim, law)
     goal, start = torch.randn(2, dim, generator=draw, dtype=torch.float64)
-    dynamics.aim(start, goal)
+    dynamics.set_endpoints(start, goal)
     x = goal + torch.randn(6, dim, generator=draw, dtype=torch.float64)
     times = torch.linspace(0, 1, 5, dtype=torch.float64)
     path = dynamics.flow(x, times)

@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 @cache
 def greedy_kernel() -> Any:
-    """The greedy match of :func:`latentds.matching.match`; moves ``moved`` in place.
+    """The greedy match of :func:`latentds.fitting.matching.match`; moves ``moved`` in place.
 
     (moved, y: (N, n); β, μ²e/2, largest ρ²; the point to move, -1 for the one with the largest error; layers
     (M, 2n+1) to fill with (c, v, ρ²)) -> layers filled. The loss of a layer, ‖v‖² Σ k² - 2 a k with k = exp(-ρ²d) and

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from latentds.isotopy import straight_isotopy, unbending_isotopy
+from latentds.fitting.homotopy import curvature_homotopy, linear_homotopy
 from latentds.testing import wavy_motion
 
 
@@ -34,7 +34,7 @@ bending = pytest.mark.parametrize("curve", [c for c in CURVES.values() if c.shap
 @each_curve
 def test_straight_isotopy_moves_every_point_evenly(curve, steps):
     line = np.linspace(curve[0], curve[-1], len(curve))
-    curves = straight_isotopy(line, curve, steps)
+    curves = linear_homotopy(line, curve, steps)
     assert curves.shape == (steps + 1, *curve.shape)
     assert np.array_equal(curves[0], line)
     np.testing.assert_allclose(curves[-1], curve, rtol=0, atol=1e-15)
@@ -44,7 +44,7 @@ def test_straight_isotopy_moves_every_point_evenly(curve, steps):
 @pytest.mark.parametrize("steps", [1, 7])
 @each_curve
 def test_unbending_ends_on_the_curve_and_stretches_nothing(curve, steps):
-    curves = unbending_isotopy(curve, steps)
+    curves = curvature_homotopy(curve, steps)
     assert curves.shape == (steps + 1, *curve.shape)
     assert np.array_equal(curves[-1], curve)
     np.testing.assert_allclose(lengths(curves), np.tile(lengths(curve), (steps + 1, 1)), rtol=1e-12)
@@ -52,7 +52,7 @@ def test_unbending_ends_on_the_curve_and_stretches_nothing(curve, steps):
 
 @each_curve
 def test_unbending_begins_with_a_straight_rod(curve):
-    rod = unbending_isotopy(curve, 5)[0]
+    rod = curvature_homotopy(curve, 5)[0]
     along = (rod[-1] - rod[0]) / np.linalg.norm(rod[-1] - rod[0])
     np.testing.assert_allclose(np.diff(rod, axis=0), lengths(rod)[:, None] * along, rtol=0, atol=1e-12)
 
@@ -60,7 +60,7 @@ def test_unbending_begins_with_a_straight_rod(curve):
 @bending
 def test_unbending_turns_evenly(curve):
     """In every step the angles between neighbouring segments grow by the same share."""
-    curves = unbending_isotopy(curve, 4)
+    curves = curvature_homotopy(curve, 4)
     tangents = np.diff(curves, axis=1) / lengths(curves)[..., None]
     angles = np.arctan2(
         np.linalg.norm(np.diff(tangents, axis=1), axis=-1) / 2,
@@ -72,7 +72,7 @@ def test_unbending_turns_evenly(curve):
 @each_curve
 def test_each_curve_lies_rigidly_nearest_to_the_next(curve):
     """No small shift or rotation brings one nearer to its successor."""
-    curves = unbending_isotopy(curve, 6)
+    curves = curvature_homotopy(curve, 6)
     rng = np.random.default_rng(0)
     dim = curve.shape[1]
     for one, after in pairwise(curves):
@@ -92,13 +92,13 @@ def test_unbending_moves_with_the_curve():
     turn *= np.sign(np.linalg.det(turn))
     moved = 1000 * curve @ turn + [5.0, -3.0, 2.0]
     np.testing.assert_allclose(
-        unbending_isotopy(moved, 6), 1000 * unbending_isotopy(curve, 6) @ turn + [5.0, -3.0, 2.0], rtol=0, atol=1e-6
+        curvature_homotopy(moved, 6), 1000 * curvature_homotopy(curve, 6) @ turn + [5.0, -3.0, 2.0], rtol=0, atol=1e-6
     )
 
 
 @pytest.mark.parametrize("steps", [0, -1, 1.5])
 def test_bad_steps(steps):
     curve = CURVES["2-D"]
-    for call in (lambda: straight_isotopy(curve, curve, steps), lambda: unbending_isotopy(curve, steps)):
+    for call in (lambda: linear_homotopy(curve, curve, steps), lambda: curvature_homotopy(curve, steps)):
         with pytest.raises(ValueError, match="steps: expected a whole number >= 1"):
             call()

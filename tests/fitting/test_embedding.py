@@ -10,7 +10,7 @@ import pytest
 from numpy.polynomial import Chebyshev
 from scipy.linalg import eigh
 
-from latentds.embedding import chebyshev_columns, chebyshev_eigenvalues, place, straight_column
+from latentds.fitting.embedding import chebyshev_columns, chebyshev_eigenvalues, map_to_endpoints, straight_column
 
 
 def laplacian(n_points, copies):
@@ -100,13 +100,13 @@ def test_proposition_5_is_one_over_n_only():
 
 def test_place_runs_from_start_to_goal_and_collapses_where_they_agree():
     start, goal = np.array([1.0, -2.0, 0.5]), np.array([3.0, -2.0, -1.0])
-    placed = place(chebyshev_columns(50, 3)[::-1], start, goal)
+    placed = map_to_endpoints(chebyshev_columns(50, 3)[::-1], start, goal)
     assert (placed[0] == start).all()
     assert (placed[-1] == goal).all()
     assert (placed[:, 1] == -2.0).all()
     assert (np.diff(placed[:, 0]) > 0).all()
     assert (np.diff(placed[:, 2]) < 0).all()
-    line = place(straight_column(50), start, goal)
+    line = map_to_endpoints(straight_column(50), start, goal)
     assert np.diff(line, axis=0) == pytest.approx(np.tile((goal - start) / 49, (49, 1)))
 
 

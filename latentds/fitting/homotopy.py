@@ -1,16 +1,16 @@
-"""Ways to carry a straight line onto a curve without tangling: sequences of curves for the matching to follow."""
+"""Homotopies from a straight line to a curve: sequences of curves for the matching to follow without tangling."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .arguments import whole_number
+from ..arguments import whole_number
 
 Array = NDArray[np.float64]
 
 
-def straight_isotopy(x: Array, y: Array, steps: int) -> Array:
+def linear_homotopy(x: Array, y: Array, steps: int) -> Array:
     """x + (k/K)(y - x), k = 0 … K: every point moves on a straight line. (N, n) and (N, n) -> (K+1, N, n).
 
     One step is plain greedy matching. On tight 3-D spirals it is the better of the two; in 2-D the curve can cross
@@ -21,7 +21,7 @@ def straight_isotopy(x: Array, y: Array, steps: int) -> Array:
     return moved
 
 
-def unbending_isotopy(y: Array, steps: int) -> Array:
+def curvature_homotopy(y: Array, steps: int) -> Array:
     """The curve y (N, n) with its turning scaled by k/K, k = 0 … K: from a straight rod of its length to itself.
 
     The turning from segment to segment is written in a Bishop (rotation-minimising) frame, scaled, and integrated back;

@@ -11,11 +11,12 @@ import torch
 from scipy.integrate import solve_ivp
 
 from latentds import Demonstration, datasets
-from latentds.embedding import arc_length_path
+from latentds.dynamics import TubeDynamics
+from latentds.fitting.embedding import arc_length_path
+from latentds.methods.tube import TubeDS, mean_motion
 from latentds.metrics import dtw
 from latentds.testing import wavy_motion
-from latentds.time_law import PiecewiseLinearLaw, TubeDynamics
-from latentds.tube import TubeDS, mean_motion
+from latentds.time_law import PiecewiseLinearLaw
 
 
 def tensor(values):
@@ -93,7 +94,7 @@ def test_flow_agrees_with_solve_ivp(dim, draw):
     along = PiecewiseLinearLaw(tensor([0.01, 0.4, 1.0]), tensor([0.3, 2.0, 0.7]))
     dynamics = TubeDynamics(dim, along, PiecewiseLinearLaw(tensor([0.2]), tensor([1.5])))
     start, goal = torch.randn(2, dim, generator=draw, dtype=torch.float64)
-    dynamics.aim(start, goal)
+    dynamics.set_endpoints(start, goal)
     x = torch.cat([start[None], goal + 3 * torch.randn(5, dim, generator=draw, dtype=torch.float64)])
     times = torch.linspace(0, 1.5, 6, dtype=torch.float64)
     path = dynamics.flow(x, times)
@@ -111,15 +112,15 @@ def test_progress_falls_by_the_law_from_wherever_it_starts(draw):
     law = PiecewiseLinearLaw(tensor([0.01, 0.4, 1.0]), tensor([0.3, 2.0, 0.7]))
     dynamics = TubeDynamics(3, law, PiecewiseLinearLaw(tensor([0.2]), tensor([1.5])))
     start, goal, aside = torch.randn(3, 3, generator=draw, dtype=torch.float64)
-    dynamics.aim(start, goal)
-    torch.testing.assert_close(dynamics.progress(torch.stack([start, goal, (start + goal) / 2])), tensor([1, 0, 0.5]))
-    s = dynamics.progress(dynamics.flow(goal + (start - goal) * 0.9 + 0.1 * aside, tensor([0.0, 0.1])))
+    dynamics.set_endpoints(start, goal)
+    torch.testing.assert_close(dynamics.phase(torch.stack([start, goal, (start + goal) / 2])), tensor([1, 0, 0.5]))
+    s = dynamics.phase(dynamics.flow(goal + (start - goal) * 0.9 + 0.1 * aside, tensor([0.0, 0.1])))
     torch.testing.assert_close(law.time_to_go(s[0]) - law.time_to_go(s[1]), tensor(0.1))
 
 
 def test_offset_shrinks_at_the_rate_and_no_faster_than_the_cap():
     dynamics = TubeDynamics(2, PiecewiseLinearLaw.uniform(), PiecewiseLinearLaw(tensor([0.25]), tensor([0.25 * 8])))
-    dynamics.aim(tensor([2.0, 0.0]), tensor([0.0, 0.0]))
+    dynamics.set_endpoints(tensor([2.0, 0.0]), tensor([0.0, 0.0]))
     near = dynamics.flow(tensor([1.0, 0.4]), tensor([0.0, 0.1]))[:, 1]
     torch.testing.assert_close(near[1] / near[0], tensor(math.exp(-0.8)))
     offsets = tensor([[1.0, 0.5], [1.0, 5.0], [1.0, 500.0]])

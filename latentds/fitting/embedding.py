@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from .arguments import whole_number
+from ..arguments import whole_number
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ def straight_column(n_points: int) -> Array:
     return np.linspace(0, 1, n_points)[:, None]
 
 
-def place(columns: Array, start: Array, goal: Array) -> Array:
+def map_to_endpoints(columns: Array, start: Array, goal: Array) -> Array:
     """Map each column affinely so that the rows run from ``start`` to ``goal``, both (n,): (N, n) or (N, 1) -> (N, n).
 
     A coordinate in which start and goal coincide collapses to it.

@@ -14,9 +14,9 @@ from scipy.integrate import solve_ivp
 
 import baselines.sdsef
 from baselines import SDSEF
+from baselines.training import MAX_RECOVERIES, Plan, descend
 from latentds import Demonstration, datasets
 from latentds.testing import wavy_motion
-from latentds.training import MAX_RECOVERIES, Plan, descend
 
 
 @pytest.fixture(autouse=True)

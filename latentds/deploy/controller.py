@@ -10,11 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .base import LatentDS, StableDS
-from .diffeomorphism import LocallyWeightedTranslations
-from .kernels.translations import layers_of
-from .kernels.velocity import velocity_kernel
-from .time_law import ChebyshevLaw, PiecewiseLinearLaw, RayDynamics, TimeLaw, TubeDynamics
+from ..kernels.velocity import velocity_kernel
+from .tables import VelocityField
 
 Array = NDArray[np.float64]
 
@@ -35,14 +32,14 @@ class Controller:
         compiled: whether calls bypass torch.
     """
 
-    def __init__(self, ds: StableDS) -> None:
+    def __init__(self, ds: VelocityField) -> None:
         self.dim = ds.dim
-        numbers = _numbers(ds)
-        self.compiled = numbers is not None
-        if numbers is None:
+        tables = ds.tables()
+        self.compiled = tables is not None
+        if tables is None:
             self._ds = copy.deepcopy(ds).requires_grad_(False)
         else:
-            self._numbers, self._kernel = numbers, velocity_kernel(self.dim)
+            self._tables, self._kernel = tables, velocity_kernel(self.dim)
             self._local = threading.local()
         self(np.zeros(self.dim))
 
@@ -68,7 +65,7 @@ class Controller:
             )
         if self.compiled:
             rows = y.size // self.dim
-            finite = self._kernel(*self._numbers, y.reshape(rows, self.dim), out.reshape(rows, self.dim), self._room())
+            finite = self._kernel(*self._tables, y.reshape(rows, self.dim), out.reshape(rows, self.dim), self._room())
         else:
             finite = bool(np.isfinite(y).all())
             if finite:
@@ -82,7 +79,7 @@ class Controller:
         try:
             return self._local.room  # type: ignore[no-any-return]
         except AttributeError:
-            self._local.room = np.empty((len(self._numbers[0]) + 1, self.dim + 1))
+            self._local.room = np.empty((len(self._tables.layers) + 1, self.dim + 1))
             return self._local.room  # type: ignore[no-any-return]
 
 
@@ -94,36 +91,3 @@ def _real(y: Any) -> Array:
     except (TypeError, ValueError):
         raise ValueError(f"y: expected real numbers, got {type(y).__name__}") from None
     return np.ascontiguousarray(array, dtype=np.float64)
-
-
-def _numbers(ds: StableDS) -> tuple[Array, Array, Array, Array] | None:
-    """The system as the velocity kernel reads it: layers, goal, and both rates; None if it cannot."""
-    if not isinstance(ds, LatentDS) or type(ds).forward is not LatentDS.forward:
-        return None
-    psi, dynamics = ds.diffeomorphism, ds.dynamics
-    if type(psi) is not LocallyWeightedTranslations:
-        return None
-    if type(dynamics) is TubeDynamics:
-        along, across, axis = _table(dynamics.law), _table(dynamics.pull), _array(dynamics.axis)
-    elif type(dynamics) is RayDynamics:  # all of the offset counts as across
-        along = across = _table(dynamics.law)
-        axis = np.zeros(ds.dim)
-    else:
-        return None
-    if along is None or across is None:
-        return None
-    goal = np.stack([_array(dynamics.attractor), axis, np.full(ds.dim, float(dynamics.length))])
-    layers = layers_of(copy.deepcopy(psi).to("cpu", torch.float64))
-    return layers, goal, along, across
-
-
-def _table(law: TimeLaw) -> Array | None:
-    if type(law) is ChebyshevLaw:
-        return np.array([[-1.0], [float(law.omega)]])
-    if type(law) is PiecewiseLinearLaw:
-        return np.stack([_array(law.knots), _array(law.speeds)])
-    return None
-
-
-def _array(tensor: torch.Tensor) -> Array:
-    return np.array(tensor.detach().cpu().to(torch.float64).numpy())

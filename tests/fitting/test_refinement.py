@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 import torch
 
-from latentds import datasets, refinement
+from latentds import datasets
 from latentds.diffeomorphism import WIDTH_BOUND, Layers, LocallyWeightedTranslations
-from latentds.embedding import place, straight_column
-from latentds.matching import match
-from latentds.refinement import refine
+from latentds.fitting import refinement
+from latentds.fitting.embedding import map_to_endpoints, straight_column
+from latentds.fitting.matching import match
+from latentds.fitting.refinement import refine
 from latentds.testing import wavy_motion
 
 
 def pairs(dim, count=120):
     y = wavy_motion(dim, n_points=count).positions.numpy()
-    return place(straight_column(count), y[0], y[-1]), y
+    return map_to_endpoints(straight_column(count), y[0], y[-1]), y
 
 
 def decode(layers, x):
@@ -86,7 +87,7 @@ def test_error_falls_and_the_bound_holds(dim):
 @pytest.mark.parametrize("steps", [1, 5, 300])
 def test_error_never_rises(steps):
     shown = datasets.unstable_spiral(3, 200).positions.numpy()
-    x = place(straight_column(len(shown)), shown[0], shown[-1])
+    x = map_to_endpoints(straight_column(len(shown)), shown[0], shown[-1])
     layers = match(x, shown, 40, 0.9, 0.9)
     assert mse(refine(layers, x, shown, 0.9, steps=steps), x, shown) <= mse(layers, x, shown)
 

@@ -11,7 +11,7 @@ import sys
 import pytest
 import torch
 
-from latentds.diffeomorphism import AffineCouplings
+from baselines.couplings import AffineCouplings
 
 
 def couplings(dim, n_layers=5, n_features=20, seed=0, strength=0.15):
@@ -143,7 +143,7 @@ def test_bad_arguments_are_named(argument, value):
 
 GRADIENT = """
 import torch
-from latentds.coupling_kernels import Couplings
+from baselines.coupling_kernels import Couplings
 
 draw = torch.Generator().manual_seed(0)
 sizes = [(2, 1), (1, 2)] * 2

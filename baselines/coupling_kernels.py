@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .kernels.compiling import cached
+from latentds.kernels.compiling import cached
 
 F32 = np.float32
 Array = Any

@@ -15,7 +15,7 @@ from experiments.spirals import Setting
 from experiments.tuning import Choice, Grid, Tried, choose
 from latentds import ChebyshevDS, benchmark, datasets
 from latentds.benchmark import Protocol
-from latentds.embedding import chebyshev_eigenvalues
+from latentds.fitting.embedding import chebyshev_eigenvalues
 
 SMALL = Grid(betas=(0.3, 0.9), mus=(0.6, 0.9), n_layers=(5, 10, 75), n_more=1)
 

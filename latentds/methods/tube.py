@@ -1,4 +1,4 @@
-"""TubeDS, our own method: an arc-length line, continuation along the better isotopy, refinement, a contracting tube."""
+"""TubeDS, our own method: an arc-length line, continuation along a homotopy, refinement, a contracting tube."""
 
 from __future__ import annotations
 
@@ -13,27 +13,28 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .arguments import number_in
-from .base import FitReport, LatentDS
-from .demonstration import Demonstration, demonstrations_of
-from .diffeomorphism import Layers, LocallyWeightedTranslations
-from .embedding import arc_length_path, place, straight_column
-from .isotopy import straight_isotopy, unbending_isotopy
-from .matching import carried, fitting, match_along
-from .metrics import dtw
-from .refinement import refine
-from .time_law import PiecewiseLinearLaw, TubeDynamics
+from ..arguments import number_in
+from ..base import FitReport, LatentDS
+from ..demonstration import Demonstration, demonstrations_of
+from ..diffeomorphism import Layers, LocallyWeightedTranslations
+from ..dynamics import TubeDynamics
+from ..fitting.embedding import arc_length_path, map_to_endpoints, straight_column
+from ..fitting.homotopy import curvature_homotopy, linear_homotopy
+from ..fitting.matching import apply_layers, match_along, restore_on_failure
+from ..fitting.refinement import refine
+from ..metrics import dtw
+from ..time_law import PiecewiseLinearLaw
 
 Array = NDArray[np.float64]
 
 N_POINTS = 600
 """Points, even in arc length, that ψ is matched on."""
-STRAIGHT = ((20, 1.0), (20, 2.0), (20, 4.0), (5, 2.0), (5, 4.0))
-"""Matches tried along the straight isotopy: steps, and length of the latent line in distances from start to goal."""
-UNBENDING = ((20, (1.5, 6.0, 12.0)), (5, (1.5, 6.0)))
-"""And along the unbending one: steps, and least widths 1/ρ of a layer in distances between points of the path."""
+LINEAR = ((20, 1.0), (20, 2.0), (20, 4.0), (5, 2.0), (5, 4.0))
+"""Matches tried along the linear homotopy: steps, and length of the latent line in distances from start to goal."""
+CURVATURE = ((20, (1.5, 6.0, 12.0)), (5, (1.5, 6.0)))
+"""And along the curvature homotopy: steps, and least widths 1/ρ of a layer in distances between points of the path."""
 WIDTH = 3.0
-"""That of a layer along the straight one: narrower layers fit the path better, and what lies beside it worse."""
+"""That of a layer along the linear one: narrower layers fit the path better, and what lies beside it worse."""
 DECIMALS = 9
 """To which the motion is rounded, in its own sizes."""
 TUBE = 0.02
@@ -42,11 +43,11 @@ NEAR, STARTS = 0.05, 32
 """Distance from the demonstrated start, in sizes of the motion, and number of the starts that also judge a match."""
 ROWS = 120
 """Points, even in time, of the rollouts that judge a match."""
-STIFF = 100.0
+MAX_CONDITION = 100.0
 """cond(J) along the path above which a match is judged by all of it, below by its root."""
 TRIES, CLOSE = 3, 1.3
 """So many matches are refined if they score within this factor of the best, …"""
-ENOUGH = 0.06
+GOOD_SCORE = 0.06
 """… and further ones until one scores less than this, or three times this after so many."""
 FAR = 0.25
 """Distance from the axis, in sizes of the motion, beyond which the inward pull stops growing."""
@@ -57,7 +58,7 @@ class TubeReport(FitReport):
     """What a fit of :class:`TubeDS` reached and what it costs.
 
     Attributes:
-        isotopy: "straight" or "unbending", the one that was kept.
+        isotopy: the homotopy that was kept, "straight" (linear) or "unbending" (curvature).
         rollout_error: mean distance of the rollout from the demonstrated start to the demonstration at equal progress,
             in sizes of the motion.
         condition_path: largest cond(J_ψ) along the path.
@@ -81,7 +82,7 @@ class TubeDS(LatentDS):
     """Stable motion that keeps to a contracting tube around the demonstration, with nothing to tune.
 
     Points evenly spaced in arc length are matched to a straight line, so that ψ is near-isometric along the path; the
-    timing lives in the time law alone. Matching follows the straight or the unbending isotopy, whichever rolls out
+    timing lives in the time law alone. Matching follows the linear or the curvature homotopy, whichever rolls out
     better and is better conditioned, and is then refined jointly. Across the path the latent point is drawn in at
     rate κ. The attractor is exact.
 
@@ -94,6 +95,9 @@ class TubeDS(LatentDS):
             3/κ of it. A larger κ costs proportionally larger velocity gradients (see the report).
         refined: whether L-BFGS refines the match; without it a fit takes a tenth of the time.
     """
+
+    diffeomorphism: LocallyWeightedTranslations
+    dynamics: TubeDynamics
 
     def __init__(self, dim: int, *, n_layers: int = 300, contraction: float = 20.0, refined: bool = True) -> None:
         along, across = PiecewiseLinearLaw.uniform(), PiecewiseLinearLaw(torch.ones(1), torch.ones(1))
@@ -110,52 +114,44 @@ class TubeDS(LatentDS):
         origin, unit = shown.goal.numpy(), shown.size
         shape = Demonstration(((shown.positions - shown.goal) / unit).round(decimals=DECIMALS), shown.dt)
         path, way, times = arc_length_path(shape.positions.numpy(), shape.times.numpy(), N_POINTS)
-        _refuse_crossings(path)
-        with fitting(self, shown):
+        _refuse_crossings(path, origin, unit)
+        with restore_on_failure(self, shown):
             law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
             judged = []
-            for candidate in _candidates(path, self.psi.n_layers):
-                self._lay(candidate, shape, law)
+            for candidate in _candidates(path, self.diffeomorphism.n_layers):
+                self._take(candidate, shape, law)
                 judged.append((self._score(shape), candidate))
             judged.sort(key=lambda pair: pair[0])
             if self.refined:
                 for tried, (score, candidate) in enumerate(list(judged)):
                     close = tried < TRIES and score < CLOSE * judged[0][0]
-                    enough = min(score for score, _ in judged) < ENOUGH * (1 if tried < TRIES else 3)
+                    enough = min(score for score, _ in judged) < GOOD_SCORE * (1 if tried < TRIES else 3)
                     if tried and enough and not close:
                         break
                     better = candidate.refined(path)
-                    self._lay(better, shape, law)
+                    self._take(better, shape, law)
                     judged.append((self._score(shape), better))
             best = min(judged, key=lambda pair: pair[0])[1].placed(origin, unit)
-            self._lay(best, shown, law)
+            self._take(best, shown, law)
             report = self._report(best, origin + unit * path, shown, spread, began)
             self.fit_report = replace(report, learned_from=tuple(one.fingerprint for one in every))
         return self
 
-    @property
-    def psi(self) -> LocallyWeightedTranslations:
-        """The diffeomorphism, as what it is."""
-        assert isinstance(self.diffeomorphism, LocallyWeightedTranslations)
-        return self.diffeomorphism
-
     @torch.no_grad()
-    def _lay(self, candidate: Candidate, shown: Demonstration, law: PiecewiseLinearLaw) -> None:
+    def _take(self, candidate: Candidate, shown: Demonstration, law: PiecewiseLinearLaw) -> None:
         """Take a match, and lay the dynamics from the encoded start to the encoded goal."""
-        assert isinstance(self.dynamics, TubeDynamics)
-        self.psi.assign(*(torch.from_numpy(part) for part in candidate.layers))
+        self.diffeomorphism.assign(*(torch.from_numpy(part) for part in candidate.layers))
         self.attractor.copy_(shown.goal)
         start = shown.start.to(self.attractor)
-        self.dynamics.aim(self.psi.inverse(start), self.psi.inverse(self.attractor))
+        self.dynamics.set_endpoints(self.diffeomorphism.inverse(start), self.diffeomorphism.inverse(self.attractor))
         far = torch.as_tensor(FAR * shown.size) / self.dynamics.length.cpu()
         self.dynamics.law = law.to(self.attractor)
-        pull = PiecewiseLinearLaw(far.reshape(1), (far * self.contraction / shown.duration).reshape(1))
-        self.dynamics.pull = pull.to(self.attractor)
+        transverse = PiecewiseLinearLaw(far.reshape(1), (far * self.contraction / shown.duration).reshape(1))
+        self.dynamics.transverse_law = transverse.to(self.attractor)
 
     @torch.no_grad()
     def _score(self, shown: Demonstration) -> float:
         """How badly it rolls out from the demonstrated start (thrice) and NEAR it, times √cond(J), or more."""
-        assert isinstance(self.dynamics, TubeDynamics)
         around = np.random.default_rng(1).standard_normal((STARTS, self.dim))
         around *= NEAR * shown.size / np.linalg.norm(around, axis=1, keepdims=True)
         starts = shown.start + torch.from_numpy(np.concatenate([np.zeros((1, self.dim)), around]))
@@ -163,46 +159,42 @@ class TubeDS(LatentDS):
         times, step = np.linspace(0, shown.duration, ROWS, retstep=True)
         paths = self.rollout(starts, torch.from_numpy(times)).cpu().numpy()
         # Which fraction of a step a start is ahead is chance, and would drown the rest where steps are long.
-        share = self.dynamics.progress(self.encode(starts)).abs()
+        share = self.dynamics.phase(self.encode(starts)).abs()
         left = self.dynamics.law.time_to_go(share).cpu().numpy()
         ahead = (left[0] - left) / step
         clocks = times + step * (ahead - ahead.round())[:, None]
         misses = [dtw(path, motion) / ROWS / shown.size for path, motion in zip(paths, shown.at(clocks), strict=True)]
-        condition = self._condition(self._line())
-        score = (3 * misses[0] + float(np.mean(misses[1:]))) * math.sqrt(condition) * max(1.0, condition / STIFF)
+        condition = float(self.condition_number(self._line()).max())
+        score = (3 * misses[0] + float(np.mean(misses[1:]))) * math.sqrt(condition)
+        score *= max(1.0, condition / MAX_CONDITION)
         return score if math.isfinite(score) else math.inf
 
     def _line(self) -> Tensor:
         """Latent points from the encoded start to x*, one for each of the path, (N_POINTS, n)."""
-        assert isinstance(self.dynamics, TubeDynamics)
         share = torch.linspace(1, 0, N_POINTS, dtype=self.attractor.dtype, device=self.attractor.device)
         return self.dynamics.attractor + share.unsqueeze(-1) * self.dynamics.length * self.dynamics.axis
-
-    def _condition(self, line: Tensor) -> float:
-        return float(torch.linalg.cond(self.psi.jacobian(line)).max())
 
     @torch.no_grad()
     def _report(
         self, best: Candidate, path: Array, shown: Demonstration, spread: tuple[float, ...], began: float
     ) -> TubeReport:
-        assert isinstance(self.dynamics, TubeDynamics)
         line = self._line()
         across = torch.linalg.svd(self.dynamics.axis.unsqueeze(-1))[0][:, 1:].T * TUBE * self.dynamics.length
         tube = torch.cat([line, *(line[::4] + side * offset for offset in across for side in (1, -1))])
-        missed = torch.linalg.vector_norm(self.psi(line).cpu() - torch.from_numpy(path), dim=-1).mean()
-        y = self.psi(tube)
+        missed = torch.linalg.vector_norm(self.diffeomorphism(line).cpu() - torch.from_numpy(path), dim=-1).mean()
+        y = self.diffeomorphism(tube)
         step = 1e-6 * shown.size
         nudges = step * torch.eye(self.dim, dtype=y.dtype, device=y.device)
         slopes = (self(y.unsqueeze(-2) + nudges) - self(y.unsqueeze(-2) - nudges)) / (2 * step)
         length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
         return TubeReport(
             mse=best.mse(path),
-            n_layers=self.psi.n_layers,
+            n_layers=self.diffeomorphism.n_layers,
             seconds=time.perf_counter() - began,
             isotopy=best.isotopy,
             rollout_error=float(missed) / shown.size,
-            condition_path=self._condition(line),
-            condition_tube=self._condition(tube),
+            condition_path=float(self.condition_number(line).max()),
+            condition_tube=float(self.condition_number(tube).max()),
             largest_velocity=float(torch.linalg.vector_norm(self(y), dim=-1).max()) * shown.duration / length,
             largest_gradient=float(torch.linalg.matrix_norm(slopes, 2).max()) * shown.duration,
             spread=spread,
@@ -229,25 +221,25 @@ class Candidate(NamedTuple):
         return self._replace(layers=layers, line=origin + unit * self.line)
 
     def mse(self, path: Array) -> float:
-        return float(np.square(carried(self.layers, self.line) - path).mean())
+        return float(np.square(apply_layers(self.layers, self.line) - path).mean())
 
 
 def _candidates(path: Array, n_layers: int) -> Iterator[Candidate]:
-    """Matches of a line to the path (N, n), along either isotopy."""
+    """Matches of a line to the path (N, n), along either homotopy."""
     apart = float(np.linalg.norm(np.diff(path, axis=0), axis=1).max())  # less where a corner is cut
-    chord = place(straight_column(len(path)), path[0], path[-1])
+    chord = map_to_endpoints(straight_column(len(path)), path[0], path[-1])
     middle = chord.mean(0)
 
     def matched(isotopy: str, curves: Array, width: float) -> Candidate:
         return Candidate(isotopy, match_along(curves, n_layers, 0.9, 0.9, width * apart), curves[0])
 
     most = max(1, n_layers // 10)
-    for steps, stretch in STRAIGHT:
+    for steps, stretch in LINEAR:
         line = middle + stretch * (chord - middle)
-        yield matched("straight", straight_isotopy(line, path, min(steps, most)), WIDTH)
+        yield matched("straight", linear_homotopy(line, path, min(steps, most)), WIDTH)
     if path.shape[1] > 1:
-        for steps, widths in UNBENDING:
-            curves = unbending_isotopy(path, min(steps, most))
+        for steps, widths in CURVATURE:
+            curves = curvature_homotopy(path, min(steps, most))
             for width in widths:
                 yield matched("unbending", curves, width)
 
@@ -271,8 +263,10 @@ def mean_motion(shown: Sequence[Demonstration]) -> tuple[Demonstration, tuple[fl
     return mean, tuple(float(value) for value in paths.std(0).mean(0))
 
 
-def _refuse_crossings(path: Array) -> None:
+def _refuse_crossings(path: Array, origin: Array, unit: float) -> None:
     """Refuse a path that meets itself: an autonomous system has one velocity per point.
+
+    The path is told in the demonstration's units, ``origin`` + ``unit`` times it.
 
     Stretches closer along the path than 2 % of it may touch: that is noise, not a crossing.
     """
@@ -290,7 +284,7 @@ def _refuse_crossings(path: Array) -> None:
     near = np.linalg.norm(gap + s[:, None] * step[first] - t[:, None] * step[second], axis=1)
     worst = int(np.argmin(near))
     if near[worst] < 1e-7 * np.ptp(path, axis=0).max():
-        where = np.array2string(start[first[worst]], precision=4)
+        where = np.array2string(origin + unit * start[first[worst]], precision=4)
         raise ValueError(
             f"demonstration: expected a path that does not meet itself, got one that comes back to {where} "
             f"({first[worst] / count:.0%} and {(second[worst] + 1) / count:.0%} of the way); "

@@ -12,8 +12,8 @@ from scipy.optimize import minimize_scalar
 from baselines import FDM
 from latentds import ChebyshevDS, Demonstration, TubeDS, datasets
 from latentds.diffeomorphism import WIDTH_BOUND
-from latentds.embedding import chebyshev_columns, place, straight_column
-from latentds.matching import PINS, match, pin_ends
+from latentds.fitting.embedding import chebyshev_columns, map_to_endpoints, straight_column
+from latentds.fitting.matching import PINS, match, pin_ends
 from latentds.testing import wavy_motion
 
 # Table I of the paper: complexity -> (beta, mu, layers, MSE per coordinate).
@@ -37,7 +37,7 @@ TABLE_I = {
 
 def pair(shown, columns):
     y = shown.positions.numpy()
-    return place(columns, y[0], y[-1]), y
+    return map_to_endpoints(columns, y[0], y[-1]), y
 
 
 def cases():
@@ -108,7 +108,7 @@ def test_table_1(method, c):
     assert ds.fit_report.n_layers == n_layers + PINS
     latent = chebyshev_columns(1000, 3)[::-1] if method is ChebyshevDS else straight_column(1000)
     with torch.no_grad():
-        mapped = ds.decode(torch.from_numpy(place(latent, shown.start.numpy(), shown.goal.numpy())))
+        mapped = ds.decode(torch.from_numpy(map_to_endpoints(latent, shown.start.numpy(), shown.goal.numpy())))
     assert ds.fit_report.mse == pytest.approx((mapped - shown.positions).square().mean().item(), rel=1e-9)
 
 

@@ -11,8 +11,9 @@ import torch
 
 from baselines import FDM, SDSEF
 from latentds import ChebyshevDS, LatentDS, LocallyWeightedTranslations
+from latentds.dynamics import TubeDynamics
 from latentds.testing import wavy_motion
-from latentds.time_law import ChebyshevLaw, PiecewiseLinearLaw, TubeDynamics
+from latentds.time_law import ChebyshevLaw, PiecewiseLinearLaw
 
 
 class Tube(LatentDS):
@@ -26,7 +27,7 @@ class Tube(LatentDS):
         donor = ChebyshevDS(self.dim, n_layers=30, pinned=False).fit(demonstration)
         self.diffeomorphism.load_state_dict(donor.diffeomorphism.state_dict())
         self.attractor.copy_(demonstration.goal)
-        self.dynamics.aim(donor.encode(demonstration.start), donor.encode(demonstration.goal))
+        self.dynamics.set_endpoints(donor.encode(demonstration.start), donor.encode(demonstration.goal))
         return self
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -11,13 +10,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from .base import FitReport, LatentDS
-from .demonstration import Demonstration, goal_apart
-from .diffeomorphism import WIDTH_BOUND, Layers, LocallyWeightedTranslations
-from .isotopy import straight_isotopy
-from .kernels.greedy import greedy_kernel
-from .refinement import refine
-from .time_law import RayDynamics, TimeLaw
+from ..base import LatentDS
+from ..demonstration import Demonstration, goal_apart
+from ..diffeomorphism import WIDTH_BOUND, Layers, LocallyWeightedTranslations
+from ..kernels.greedy import greedy_kernel
 
 Array = NDArray[np.float64]
 
@@ -28,10 +24,10 @@ def match(x: Array, y: Array, n_layers: int, beta: float, mu: float) -> Layers:
     Each layer moves the point with the largest error by ``beta`` of it, with the ρ below μ√(e/2)/‖v‖ that leaves the
     least squared error over all points. Fewer than ``n_layers`` come back if no error is left.
     """
-    return advance(x, y, n_layers, beta, mu)[0]
+    return add_greedy_layers(x, y, n_layers, beta, mu)[0]
 
 
-def advance(
+def add_greedy_layers(
     moved: Array, y: Array, n_layers: int, beta: float, mu: float, narrowest: float = 0.0, at: int = -1
 ) -> tuple[Layers, Array]:
     """Up to ``n_layers`` greedy layers on points where they stand, and where those layers move them: (N, n).
@@ -57,10 +53,10 @@ def match_along(curves: Array, n_layers: int, beta: float, mu: float, narrowest:
     moved, targets = curves[0], curves[1:]
     share, parts = n_layers // (2 * len(targets)), []
     for target in targets[:-1]:
-        layers, moved = advance(moved, target, share, beta, mu, narrowest)
+        layers, moved = add_greedy_layers(moved, target, share, beta, mu, narrowest)
         parts.append(layers)
     left = n_layers - sum(len(layers.widths) for layers in parts)
-    parts.append(advance(moved, targets[-1], left, beta, mu, narrowest)[0])
+    parts.append(add_greedy_layers(moved, targets[-1], left, beta, mu, narrowest)[0])
     return Layers(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
@@ -74,15 +70,15 @@ def pin_ends(layers: Layers, x: Array, y: Array, mu: float) -> Layers:
     Greedy matching leaves both off by about √MSE, and where ψ is badly conditioned ψ⁻¹ of the start and of the goal
     then lies far from the ends of the latent line. Each pin is as wide as leaves the least squared error over all.
     """
-    moved, parts = carried(layers, x), [layers]
+    moved, parts = apply_layers(layers, x), [layers]
     for at in (0, len(x) - 1):
-        pin, moved = advance(moved, y, 1, 1.0, mu, at=at)
+        pin, moved = add_greedy_layers(moved, y, 1, 1.0, mu, at=at)
         parts.append(pin)
     return Layers(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 @torch.no_grad()
-def carried(layers: Layers, x: Array) -> Array:
+def apply_layers(layers: Layers, x: Array) -> Array:
     """ψ(x) of these layers, (N, n) -> (N, n)."""
     psi = LocallyWeightedTranslations(x.shape[1], max(1, len(layers.widths)))
     psi.assign(*(torch.from_numpy(part) for part in layers))
@@ -90,44 +86,8 @@ def carried(layers: Layers, x: Array) -> Array:
     return moved
 
 
-def settle(
-    ds: LatentDS,
-    latent: Array,
-    shown: Demonstration,
-    law: TimeLaw,
-    beta: float,
-    mu: float,
-    steps: int,
-    refined: bool,
-    pinned: bool,
-) -> None:
-    """Fit ψ so that it maps ``latent`` (N, n) onto the demonstration, and lay the dynamics along it.
-
-    ``steps`` of a straight isotopy; ``refined`` moves all layers together afterwards; ``pinned`` adds the pins.
-    """
-    began = time.perf_counter()
-    psi, dynamics = ds.diffeomorphism, ds.dynamics
-    assert isinstance(psi, LocallyWeightedTranslations)
-    assert isinstance(dynamics, RayDynamics)
-    points = shown.positions.numpy()
-    with fitting(ds, shown):
-        layers = match_along(straight_isotopy(latent, points, steps), psi.n_layers - PINS * pinned, beta, mu)
-        if refined:
-            layers = refine(layers, latent, points, mu)
-        if pinned:
-            layers = pin_ends(layers, latent, points, mu)
-        psi.assign(*(torch.from_numpy(part) for part in layers))
-        dynamics.law = law.to(ds.attractor)
-        with torch.no_grad():
-            ds.attractor.copy_(shown.goal)
-            dynamics.aim(psi.inverse(shown.start.to(ds.attractor)), psi.inverse(ds.attractor))
-            missed = psi(torch.from_numpy(latent).to(ds.attractor)) - shown.positions.to(ds.attractor)
-        mse, seconds = float(missed.square().mean()), time.perf_counter() - began
-        ds.fit_report = FitReport(mse, psi.n_layers, seconds, learned_from=(shown.fingerprint,))
-
-
 @contextmanager
-def fitting(ds: LatentDS, shown: Demonstration) -> Iterator[None]:
+def restore_on_failure(ds: LatentDS, shown: Demonstration) -> Iterator[None]:
     """A fit to a motion that ends apart from its start; one that fails leaves ``ds`` as it was.
 
     Invertible on paper is not invertible in floats: a map that does not lead back is refused.

@@ -1,0 +1,1 @@
+"""Fitted systems outside torch."""

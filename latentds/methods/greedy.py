@@ -1,0 +1,97 @@
+"""What the paper's method and FDM share: greedy matching of a latent line to the demonstration, and straight rays."""
+
+from __future__ import annotations
+
+import time
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ..arguments import number_in, whole_number
+from ..base import FitReport, LatentDS
+from ..demonstration import Demonstration, only_demonstration
+from ..diffeomorphism import LocallyWeightedTranslations
+from ..dynamics import RayDynamics
+from ..fitting.homotopy import linear_homotopy
+from ..fitting.matching import PINS, match_along, pin_ends, restore_on_failure
+from ..fitting.refinement import refine
+from ..time_law import TimeLaw
+
+Self = TypeVar("Self", bound="GreedyDS")
+
+
+class GreedyDS(LatentDS):
+    """ψ maps a latent line onto one demonstration by greedy locally weighted translations (Perrin 2016, Alg. 1).
+
+    The latent point moves straight to the goal. A subclass says where the latent points lie and how fast one moves.
+
+    Args:
+        dim: n >= 1.
+        n_layers: M >= 1. The paper's Table I uses 50 to 750.
+        beta: β in (0, 1], the share of the largest error that a layer moves.
+        mu: μ in (0, 1), how near to its invertibility bound a layer may come.
+        steps: continuation steps of the matching; 1 is the paper's.
+        refined: whether all layers are moved together by L-BFGS after the greedy match; the paper's are not.
+        pinned: whether two more layers bring the ends of the latent line exactly onto start and goal. The paper's are
+            off by about √MSE; without pins x* = ψ⁻¹(y*), which can lie far from the end of the line.
+    """
+
+    diffeomorphism: LocallyWeightedTranslations
+    dynamics: RayDynamics
+
+    def __init__(
+        self,
+        dim: int,
+        *,
+        n_layers: int = 150,
+        beta: float = 0.5,
+        mu: float = 0.9,
+        steps: int = 1,
+        refined: bool = False,
+        pinned: bool = True,
+    ) -> None:
+        self.n_layers = whole_number(n_layers, "n_layers", at_least=1)
+        psi = LocallyWeightedTranslations(dim, self.n_layers + PINS * bool(pinned))
+        super().__init__(dim, psi, RayDynamics(dim, self.time_law(1.0)))
+        self.beta = number_in(beta, "beta", 0, 1, ends="(]")
+        self.mu = number_in(mu, "mu", 0, 1)
+        self.steps = whole_number(steps, "steps", at_least=1)
+        self.refined = bool(refined)
+        self.pinned = bool(pinned)
+
+    @staticmethod
+    @abstractmethod
+    def latent_line(shown: Demonstration) -> NDArray[np.float64]:
+        """Where the latent point of each demonstrated one lies, from start to goal: (N, n)."""
+
+    @staticmethod
+    @abstractmethod
+    def time_law(duration: float) -> TimeLaw:
+        """How fast the latent point moves, for a demonstration of so many seconds."""
+
+    def fit(self: Self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> Self:
+        shown = only_demonstration(demonstration, self.dim, type(self).__name__)
+        began = time.perf_counter()
+        psi, points = self.diffeomorphism, shown.positions.numpy()
+        latent = self.latent_line(shown)
+        with restore_on_failure(self, shown):
+            curves = linear_homotopy(latent, points, self.steps)
+            layers = match_along(curves, psi.n_layers - PINS * self.pinned, self.beta, self.mu)
+            if self.refined:
+                layers = refine(layers, latent, points, self.mu)
+            if self.pinned:
+                layers = pin_ends(layers, latent, points, self.mu)
+            psi.assign(*(torch.from_numpy(part) for part in layers))
+            self.dynamics.law = self.time_law(shown.duration).to(self.attractor)
+            with torch.no_grad():
+                self.attractor.copy_(shown.goal)
+                start = shown.start.to(self.attractor)
+                self.dynamics.set_endpoints(psi.inverse(start), psi.inverse(self.attractor))
+                missed = psi(torch.from_numpy(latent).to(self.attractor)) - shown.positions.to(self.attractor)
+            mse, seconds = float(missed.square().mean()), time.perf_counter() - began
+            self.fit_report = FitReport(mse, psi.n_layers, seconds, learned_from=(shown.fingerprint,))
+        return self
