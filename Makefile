@@ -3,25 +3,31 @@ PYTHON ?= python3
 BIN := .venv/bin
 ARGS ?=
 
-.PHONY: compare test check speed ablation fuzz paper lasa clean
+.DEFAULT_GOAL := help
+.PHONY: help compare test test-fast check speed ablation fuzz paper lasa clean
 
-# The main job: ten spirals, every method, tables and pictures in results/spirals.
-compare: .venv/installed
+help: # What there is to make.
+	@grep -E '^[a-z -]+:.*# ' $(MAKEFILE_LIST) | sed -E 's/^([a-z -]+):[^#]*# (.*)/\1|\2/' | awk -F'|' '{printf "  make %-34s %s\n", $$1, $$2}'
+	@echo "Options go into ARGS: make compare ARGS=--quick"
+
+compare: .venv/installed # Ten spirals, every method: tables, rows and pictures in results/spirals.
 	$(BIN)/python -m experiments.spirals $(ARGS)
 
-test: .venv/installed check
+test: .venv/installed check # Linters, types and every test.
 	$(BIN)/python -m pytest -n 2 $(ARGS)
 
-check: .venv/installed
+test-fast: .venv/installed # What a change of one file should run: all but the slow tests.
+	$(BIN)/python -m pytest -n 2 -m "not slow" $(ARGS)
+
+check: .venv/installed # Linters and types.
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-speed ablation fuzz paper: .venv/installed
+speed ablation fuzz paper: .venv/installed # The studies: see the top of experiments/NAME.
 	$(BIN)/python -m experiments.$@ $(ARGS)
 
-# LASA handwriting (free for non-commercial academic use), for the studies that can use it.
-lasa: .venv/installed
+lasa: .venv/installed # LASA handwriting (free for non-commercial academic use), for the studies that can use it.
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev,lasa]'
 
 .venv/installed: pyproject.toml constraints.txt
@@ -31,5 +37,5 @@ lasa: .venv/installed
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@touch $@
 
-clean:
+clean: # Remove .venv and results.
 	rm -rf .venv results

@@ -11,7 +11,7 @@ from .methods.chebyshev import ChebyshevDS
 from .methods.tube import TubeDS
 from .storage import load
 
-__version__ = "0.1.0"
+__version__ = "0.1.0"  # the one place
 __all__ = [
     "Certificate",
     "ChebyshevDS",
