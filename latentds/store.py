@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import copyreg
+import dis
+import functools
 import hashlib
 import io
 import json
 import os
+import pickle
 import sqlite3
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
+from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
 import torch
+from numba.extending import is_jitted
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -85,71 +90,168 @@ class CellStore:
         )
 
 
+class UnreadableError(ValueError):
+    """Something whose content or code cannot be told from another's, so that no key can stand for it."""
+
+
 def fingerprint(*things: Any) -> str:
     """A hash of values, tensors and objects all the way down, and of the code that they and this library consist of.
 
     Equal in every process for equal settings: nothing in it depends on addresses, hash seeds or order of sets.
+
+    A function counts with its bytecode, names, constants, defaults and closure, a class with its attributes and those
+    of its bases. Beside them counts where they come from: all Python files of the top-level package, which hold what
+    the code calls; of a lone module its file; and outside of packages (a script, a notebook, stdin) also the values,
+    functions and classes of the globals that the code names.
+
+    Raises:
+        UnreadableError: for what hides its content, such as a lock, a generator, or a compiled function without a name.
     """
-    digest, sources = hashlib.sha256(), set(_library())
-    for part in _parts(things, sources.add, ()):
-        digest.update(part)
-    for source in sorted(map(_content, sources)):
-        digest.update(source)
-    return digest.hexdigest()
-
-
-@cache
-def _library() -> tuple[Path, ...]:
-    drawing = {"plotting.py", "testing.py"}  # change no number
-    return tuple(path for path in Path(__file__).parent.glob("*.py") if path.name not in drawing)
-
-
-@cache
-def _content(path: Path) -> bytes:
-    return hashlib.sha256(path.read_bytes()).digest()
-
-
-def _parts(thing: Any, source: Callable[[Path], None], above: tuple[int, ...]) -> Iterator[bytes]:
-    yield f"<{type(thing).__module__}.{type(thing).__qualname__}>".encode()
-    if thing is None or isinstance(thing, _PLAIN):
-        yield repr(thing).encode()
-    elif isinstance(thing, (Tensor, np.ndarray)):
-        array = thing.detach().cpu().numpy() if isinstance(thing, Tensor) else thing
-        yield f"{array.dtype}{array.shape}".encode()
-        yield np.ascontiguousarray(array).tobytes()
-    elif id(thing) in above:
-        yield f"^{len(above) - above.index(id(thing))}".encode()
-    else:
-        for child in _children(thing, source):
-            yield from _parts(child, source, (*above, id(thing)))
-    yield b"</>"
-
-
-def _children(thing: Any, source: Callable[[Path], None]) -> list[Any]:
-    if isinstance(thing, Mapping):
-        return [item for pair in thing.items() for item in pair]
-    if isinstance(thing, (list, tuple)):
-        return list(thing)
-    if isinstance(thing, (set, frozenset)):
-        return sorted(fingerprint(item) for item in thing)
-    if isinstance(thing, type):
-        _cite(thing, source)
-        return [thing.__qualname__]
-    if isinstance(thing, FunctionType):
-        code = thing.__code__
-        return [thing.__qualname__, code.co_code, [c for c in code.co_consts if not isinstance(c, CodeType)]]
-    if isinstance(thing, ModuleType):
-        return [thing.__name__]
-    for base in type(thing).__mro__:
-        _cite(base, source)
+    reading = _Reading()
     try:
-        reduced = thing.__reduce_ex__(2)  # what a pickle of it would hold
-    except Exception:
-        return [vars(thing)] if hasattr(thing, "__dict__") else []
-    return [reduced] if isinstance(reduced, str) else [list(p) if isinstance(p, Iterator) else p for p in reduced]
+        reading.add(things, ())
+    except RecursionError:
+        raise UnreadableError("expected things that can be read to their end, got some nested too deeply") from None
+    for source in sorted(reading.sources | {_package(str(Path(__file__).parent))}):
+        reading.digest.update(source)
+    return reading.digest.hexdigest()
 
 
-def _cite(kind: type, source: Callable[[Path], None]) -> None:
-    file = getattr(sys.modules.get(kind.__module__), "__file__", None)
-    if file and Path(file).suffix == ".py":
-        source(Path(file))
+_DRAWING = {"plotting.py", "testing.py"}
+"""Files of this library that change no number."""
+_CODE = (
+    "co_code", "co_consts", "co_names", "co_varnames", "co_freevars", "co_cellvars", "co_flags", "co_argcount",
+    "co_posonlyargcount", "co_kwonlyargcount", "co_exceptiontable",
+)  # fmt: skip
+
+
+@cache
+def _content(path: str) -> bytes:
+    return hashlib.sha256(Path(path).read_bytes()).digest()
+
+
+@cache
+def _package(folder: str) -> bytes:
+    """The Python files of a package and its subpackages."""
+    digest, ours = hashlib.sha256(), Path(folder) == Path(__file__).parent
+    for path in sorted(Path(folder).rglob("*.py")):
+        if not (ours and path.name in _DRAWING):
+            digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
+    return digest.digest()
+
+
+class _Reading:
+    """One fingerprint in the making."""
+
+    def __init__(self) -> None:
+        self.digest = hashlib.sha256()
+        self.sources: set[bytes] = set()
+        self.seen: list[type | FunctionType] = []
+        """Each is read once: they name each other."""
+
+    def add(self, thing: Any, above: tuple[int, ...]) -> None:
+        self.digest.update(f"<{type(thing).__module__}.{type(thing).__qualname__}>".encode())
+        if thing is None or thing is ... or isinstance(thing, _PLAIN) or type(thing).__module__ == "typing":
+            self.digest.update(repr(thing).encode())
+        elif isinstance(thing, (Tensor, np.ndarray)):
+            array = thing.detach().cpu().numpy() if isinstance(thing, Tensor) else thing
+            self.digest.update(f"{array.dtype}{array.shape}".encode())
+            if array.dtype.hasobject:
+                self.add(array.tolist(), above)
+            else:
+                self.digest.update(np.ascontiguousarray(array).tobytes())
+        elif id(thing) in above:
+            self.digest.update(f"^{len(above) - above.index(id(thing))}".encode())
+        else:
+            for child in self._children(thing):
+                self.add(child, (*above, id(thing)))
+        self.digest.update(b"</>")
+
+    def _children(self, thing: Any) -> list[Any]:
+        if isinstance(thing, CodeType):
+            return [getattr(thing, name, None) for name in _CODE]
+        if isinstance(thing, CellType):
+            try:
+                return [thing.cell_contents]
+            except ValueError:  # still empty
+                return []
+        if isinstance(thing, ModuleType):
+            self._cite(thing.__name__)
+            return [thing.__name__]
+        if isinstance(thing, (type, FunctionType)):
+            if (place := next((i for i, known in enumerate(self.seen) if known is thing), None)) is not None:
+                return [place]
+            self.seen.append(thing)
+            return self._class(thing) if isinstance(thing, type) else self._function(thing)
+        if isinstance(thing, (staticmethod, classmethod)):
+            return [thing.__func__]
+        if isinstance(thing, property):
+            return [thing.fget, thing.fset, thing.fdel]
+        if isinstance(thing, functools.cached_property):
+            return [thing.func]
+        if isinstance(thing, functools._lru_cache_wrapper):
+            return [thing.__wrapped__]
+        if is_jitted(thing):
+            return [thing.py_func, thing.targetoptions]
+        known = [] if type(thing).__module__ == "builtins" else [type(thing)]
+        if isinstance(thing, Mapping):
+            return known + [item for pair in thing.items() for item in pair]
+        if isinstance(thing, (list, tuple)):
+            return known + list(thing)
+        if isinstance(thing, (set, frozenset)):
+            return known + sorted(fingerprint(item) for item in thing)
+        return known + self._object(thing)
+
+    def _class(self, kind: type) -> list[Any]:
+        self._cite(kind.__module__)
+        found: list[Any] = [kind.__qualname__, *kind.__bases__]
+        for name, value in sorted(vars(kind).items()):
+            about = name.startswith("__") and not callable(value) and not hasattr(type(value), "__get__")
+            if not about and name != "_abc_impl":
+                slot = getattr(value, "__objclass__", None) is kind  # compiled, and found by its name
+                found += [name] if slot else [name, value]
+        return found
+
+    def _function(self, function: FunctionType) -> list[Any]:
+        code, around = function.__code__, function.__globals__
+        found = [function.__qualname__, code, function.__defaults__, function.__kwdefaults__, function.__closure__]
+        if not self._cite(around.get("__name__")):  # not __module__, which a decorator copies
+            found += [part for name in sorted(_globals(code) & set(around)) for part in (name, around[name])]
+        return found
+
+    def _object(self, thing: Any) -> list[Any]:
+        reduce: Any = copyreg.dispatch_table.get(type(thing))
+        try:
+            reduced = reduce(thing) if reduce else thing.__reduce_ex__(2)  # what a pickle of it would hold
+        except Exception:
+            raise UnreadableError(f"expected what can be told from another of its kind, got {thing!r:.200}") from None
+        if isinstance(reduced, tuple):
+            return [list(part) if isinstance(part, Iterator) else part for part in reduced]
+        module = pickle.whichmodule(thing, reduced)  # type: ignore[attr-defined]
+        try:
+            found = functools.reduce(getattr, reduced.split("."), sys.modules[module])
+        except (KeyError, AttributeError):
+            found = None
+        if found is not thing:
+            raise UnreadableError(f"expected code that can be read or found by its name, got {thing!r:.200}")
+        self._cite(module)
+        return [reduced]
+
+    def _cite(self, name: str | None) -> bool:
+        """Note the files that a module's code comes from; whether they hold what the code calls, too."""
+        module = sys.modules.get(name or "")
+        spec = getattr(module, "__spec__", None)
+        root = sys.modules.get((getattr(spec, "parent", None) or "").partition(".")[0])
+        folders, file = getattr(root, "__path__", ()), getattr(module, "__file__", None)
+        if folders:
+            self.sources.update(map(_package, folders))
+        elif file and os.path.isfile(file):
+            self.sources.add(_content(file))
+        return bool(folders) or (name or "").partition(".")[0] in sys.stdlib_module_names
+
+
+def _globals(code: CodeType) -> set[str]:
+    """Names that a function, and those nested in it, look up in their module."""
+    inner = [_globals(part) for part in code.co_consts if isinstance(part, CodeType)]
+    named = {step.argval for step in dis.get_instructions(code) if step.opname in ("LOAD_GLOBAL", "LOAD_NAME")}
+    return named.union(*inner)

@@ -2,21 +2,25 @@
 
 import functools
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
+from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 import torch
 
 from baselines import FDM, SDSEF
 from experiments import kill
-from latentds import ChebyshevDS, Demonstration, datasets
+from latentds import ChebyshevDS, Demonstration, datasets, store
 from latentds.benchmark import Cell, Protocol, _key, compare, run
-from latentds.store import CellStore, fingerprint
+from latentds.store import CellStore, UnreadableError, fingerprint
 
 SPIRAL = datasets.unstable_spiral(1, 60)
 QUICK = {"n_starts": 1, "n_points": 30, "n_jobs": 1}
@@ -154,24 +158,198 @@ def test_fingerprints_tell_values_apart_and_know_them_again():
     assert hashes == [fingerprint(thing) for thing in things()]
 
 
-def test_fingerprints_do_not_depend_on_the_process():
-    code = """
-import torch
-from baselines import SDSEF
+def closing_over(value):
+    return lambda x: x + value
+
+
+def nesting(power):
+    """Two functions that differ in a function inside them."""
+    if power == 2:
+        return lambda rows: [(lambda x: x**2)(row) for row in rows]
+    return lambda rows: [(lambda x: x**3)(row) for row in rows]
+
+
+def looping():
+    def down(n):
+        return 0 if n == 0 else down(n - 1)
+
+    return down
+
+
+def test_functions_are_told_apart_by_all_that_they_compute_with():
+    def functions():
+        return [
+            lambda x: np.mean(x), lambda x: np.max(x), lambda x: len(x), lambda x: sum(x),
+            closing_over(1), closing_over(2), nesting(2), nesting(3), looping(),
+            lambda x, a=1: a, lambda x, a=2: a, lambda x, *, a=1: a, lambda x, *, a=2: a,
+            lambda x: x in {"a", "b", "c"}, lambda x: x in {"a", "b", "d"},
+            functools.cache(closing_over(1)), functools.cache(closing_over(2)),
+            numba.njit(closing_over(1)), numba.njit(closing_over(2)), numba.njit(closing_over(2), fastmath=True),
+            np.log1p, np.expm1, np.linalg.norm, str.upper, str.lower, "a".join, "b".join,
+        ]  # fmt: skip
+
+    keys = [fingerprint(function) for function in functions()]
+    assert len(set(keys)) == len(keys)
+    assert keys == [fingerprint(function) for function in functions()]
+    first, second = functions()[:2]
+    assert fingerprint(first, second, first) != fingerprint(first, second, second)
+
+
+class Gain:
+    limit = 1.0
+    shapes = [1, 2]  # noqa: RUF012
+
+    def raised(self, x):
+        return 2 * x
+
+    @property
+    def doubled(self):
+        return self.raised(self.limit)
+
+    @functools.cached_property
+    def once(self):
+        return self.limit
+
+    @staticmethod
+    def fixed(x):
+        return x + 1
+
+
+class Inherits(Gain):
+    pass
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"limit": 2.0},
+        {"shapes": [1, 3]},
+        {"raised": lambda self, x: 3 * x},
+        {"doubled": property(lambda self: 7)},
+        {"once": functools.cached_property(lambda self: 7)},
+        {"fixed": staticmethod(lambda x: x + 2)},
+        {"more": 1},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_a_changed_class_changes_the_key_of_what_is_made_of_it(monkeypatch, change):
+    before = fingerprint(Inherits()), fingerprint(Inherits)
+    assert before == (fingerprint(Inherits()), fingerprint(Inherits))
+    for name, value in change.items():
+        monkeypatch.setattr(Gain, name, value, raising=False)
+    assert fingerprint(Inherits()) != before[0]
+    assert fingerprint(Inherits) != before[1]
+
+
+@pytest.fixture
+def forgetful():
+    """What was read of files is read anew."""
+
+    def forget():
+        store._package.cache_clear()
+        store._content.cache_clear()
+
+    yield forget
+    forget()
+
+
+def test_every_file_of_the_library_counts(tmp_path, monkeypatch, forgetful):
+    ours = tmp_path / "latentds"
+    shutil.copytree(Path(store.__file__).parent, ours, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(store, "__file__", str(ours / "store.py"))
+    (ours / "deep" / "deeper").mkdir(parents=True)
+    keys = []
+    for name in ("metrics.py", "deep/new.py", "deep/deeper/new.py"):
+        keys.append(fingerprint(1))
+        with (ours / name).open("a") as file:
+            file.write("\n# changed\n")
+        forgetful()
+    keys.append(fingerprint(1))
+    assert len(set(keys)) == 4
+    (ours / "plotting.py").write_text("")  # draws, and changes no number
+    forgetful()
+    assert fingerprint(1) == keys[-1]
+
+
+def test_every_file_of_a_methods_package_counts(tmp_path, monkeypatch, forgetful):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "theirs" / "inner").mkdir(parents=True)
+    for name in ("__init__.py", "helper.py", "inner/__init__.py"):
+        (tmp_path / "theirs" / name).write_text("")
+    (tmp_path / "theirs" / "method.py").write_text("class Method: pass\n\ndef function(): pass\n")
+    (tmp_path / "alone.py").write_text("def helper(x): return helped * x\nhelped = 1\nclass Alone: pass\n")
+    from alone import Alone, helper
+    from theirs.method import Method, function
+
+    def calls(x):
+        return helper(x)
+
+    things = {"Method": Method(), "function": function, "Alone": Alone(), "calls": calls}
+
+    def changed_by(name):
+        before = {label: fingerprint(thing) for label, thing in things.items()}
+        (tmp_path / name).write_text((tmp_path / name).read_text() + "# changed")
+        forgetful()
+        return {label for label, thing in things.items() if fingerprint(thing) != before[label]}
+
+    assert changed_by("theirs/helper.py") == {"Method", "function"}
+    assert changed_by("theirs/inner/__init__.py") == {"Method", "function"}
+    assert changed_by("alone.py") == {"Alone", "calls"}
+    before = fingerprint(calls)
+    monkeypatch.setitem(helper.__globals__, "helped", 2)
+    assert fingerprint(calls) != before
+
+
+@pytest.mark.parametrize("hidden", [threading.Lock(), (i for i in ()), np.frompyfunc(lambda x: x, 1, 1), sys.stdout])
+def test_what_cannot_be_read_has_no_key(hidden):
+    with pytest.raises(UnreadableError, match=r"expected .* got"):
+        fingerprint({"a": [hidden]})
+
+
+PRINTS = """
+import functools, numba, numpy as np, torch
+from baselines import FDM, SDSEF
 from latentds.store import fingerprint
+
+SCALE = {"b": 2.0, "a": {"x", "y", "z"}}
+
+def helper(x):
+    return x * SCALE["b"] in {"p", "q", "r"}
+
+@numba.njit
+def jitted(x):
+    return x + 1
+
+class Mine(FDM):
+    kinds = frozenset("stu")
+
+    @functools.cached_property
+    def cached(self):
+        return jitted(2)
+
+    def forward(self, y):
+        return super().forward(helper(y))
+
 torch.manual_seed(0)
-print(fingerprint(SDSEF(3, n_layers=2, n_features=10), {"b", "a", "c"}))"""
+for thing in (SDSEF(3, n_layers=2, n_features=10), {"b", "a", "c"}, Mine(3), lambda x: x in {"p", "q"}, helper, jitted):
+    print(fingerprint(thing))
+"""
+
+
+def test_fingerprints_do_not_depend_on_the_process():
     found = {
         subprocess.run(
-            [sys.executable, "-c", code],
+            [sys.executable, *arguments],
+            input=PRINTS,
             capture_output=True,
             text=True,
             check=True,
             env={**os.environ, "PYTHONHASHSEED": seed},
         ).stdout
-        for seed in "12"
+        for seed, arguments in {"1": ["-"], "2": ["-"], "3": ["-c", PRINTS]}.items()
     }
     assert len(found) == 1
+    assert len(set(found.pop().split())) == 6
 
 
 def test_a_file_of_another_kind_is_refused(file):
