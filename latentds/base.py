@@ -8,7 +8,7 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -58,6 +58,8 @@ class StableDS(nn.Module, ABC):
         dim: n >= 1.
     """
 
+    report_type: ClassVar[type[FitReport]] = FitReport
+    """The class of ``fit_report``; a method that tells more than every method does names its own."""
     attractor: Tensor
     fit_report: FitReport | None
 

@@ -7,13 +7,14 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import torch
 
-from .base import FitReport, StableDS
+from .base import StableDS
 from .demonstration import atomic_write
 from .methods.chebyshev import ChebyshevDS
 from .methods.tube import TubeDS
@@ -38,16 +39,25 @@ def save(ds: StableDS, path: str | os.PathLike[str]) -> None:
     safetensors = _safetensors()
     if not isinstance(ds, StableDS):
         raise ValueError(f"ds: expected a StableDS, got {type(ds).__name__}")
-    try:
-        settings = ds.settings
-        text = json.dumps(
-            {"format": FORMAT, "class": type(ds).__name__, "settings": settings, "report": _told(ds.fit_report)}
-        )
-        assert all(isinstance(value, (int, float, str, type(None))) for value in settings.values())
-    except (AttributeError, TypeError, AssertionError) as error:
+    if lost := [name for name in inspect.signature(type(ds)).parameters if not hasattr(ds, name)]:
         raise ValueError(
-            f"ds: expected plain constructor arguments kept as attributes of the same names, got {error or settings!r}"
-        ) from None
+            f"ds: expected constructor arguments kept as attributes of the same names, got none for {', '.join(lost)}"
+        )
+    settings = ds.settings
+    for name, value in settings.items():
+        if not isinstance(value, (int, float, str, type(None))):
+            raise ValueError(f"ds: expected numbers, strings, booleans or None as settings, got {name}={value!r:.80}")
+    report = ds.fit_report
+    if report is not None and type(report) is not ds.report_type:
+        kind = type(ds).__name__
+        raise ValueError(
+            f"ds: expected a fit_report of {kind}.report_type, {ds.report_type.__name__}, got {type(report).__name__}"
+        )
+    told = None if report is None else asdict(report)
+    try:
+        text = json.dumps({"format": FORMAT, "class": type(ds).__name__, "settings": settings, "report": told})
+    except TypeError as error:
+        raise ValueError(f"ds: expected a fit_report of numbers, strings, booleans and tuples, got {error}") from None
     state = {name: value.detach().cpu().contiguous() for name, value in ds.state_dict().items()}
     with atomic_write(path) as file:
         file.write(safetensors.torch.save(state, metadata={"latentds": text}))
@@ -115,26 +125,27 @@ def _rebuilt(text: str, state: dict[str, torch.Tensor], known: dict[str, type[St
     if not dtype.is_floating_point:
         raise ValueError(f"expected a floating attractor, got {dtype}")
     ds.to(dtype).load_state_dict(state)
-    ds.fit_report = _report(told.get("report"))
+    ds.fit_report = None if told["report"] is None else _typed(told["report"], ds.report_type, "report")
     return ds
 
 
-def _told(report: FitReport | None) -> dict[str, Any] | None:
-    return None if report is None else {part.name: getattr(report, part.name) for part in fields(FitReport)}
-
-
-def _report(told: Any) -> FitReport | None:
-    """The part of a report that every method has; a method's own figures are not kept."""
-    if told is None:
-        return None
-    return FitReport(
-        float(told["mse"]),
-        int(told["n_layers"]),
-        float(told["seconds"]),
-        tuple(float(loss) for loss in told["history"]),
-        tuple(str(note) for note in told["notes"]),
-        tuple((str(name), str(digest)) for name, digest in told["learned_from"]),
-    )
+def _typed(told: Any, wanted: Any, name: str) -> Any:
+    """What JSON told, as the type that it had: a dataclass, tuple, number, string or boolean, or None beside one."""
+    inner = get_args(wanted)
+    if get_origin(wanted) in (Union, UnionType):
+        return None if told is None else _typed(told, next(kind for kind in inner if kind is not NoneType), name)
+    if isinstance(told, dict) and is_dataclass(wanted) and isinstance(wanted, type):
+        types = get_type_hints(wanted)
+        if odd := sorted(set(told) ^ {part.name for part in fields(wanted)}):
+            raise ValueError(f"{name}: expected the fields of {wanted.__name__}, got unknown or missing ones: {odd}")
+        return wanted(**{key: _typed(value, types[key], key) for key, value in told.items()})
+    if isinstance(told, list) and get_origin(wanted) is tuple:
+        each = inner[:1] * len(told) if inner[-1] is ... else inner
+        if len(each) == len(told):
+            return tuple(_typed(value, kind, name) for value, kind in zip(told, each, strict=True))
+    if type(told) is not wanted and (type(told), wanted) != (int, float):
+        raise ValueError(f"{name}: expected {wanted}, got {told!r:.80}")
+    return wanted(told)
 
 
 def _safetensors() -> Any:

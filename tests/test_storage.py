@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import pickle
 import struct
 import subprocess
 import sys
+from dataclasses import asdict, dataclass
 
 import pytest
 import torch
@@ -16,8 +18,10 @@ from safetensors.torch import load_file, save_file
 import latentds
 from baselines import FDM, SDSEF
 from latentds import ChebyshevDS, Demonstration, StableDS, TubeDS, datasets
+from latentds.base import FitReport
 from latentds.storage import FORMAT
 from latentds.testing import wavy_motion
+from latentds.tube import TubeReport
 
 SYSTEMS = {
     "ChebyshevDS": lambda: ChebyshevDS(3, n_layers=40, beta=0.7, mu=0.8),
@@ -51,15 +55,44 @@ def test_gives_the_system_back(fitted, tmp_path, dtype):
     assert os.listdir(tmp_path) == ["ds.safetensors"]
 
 
-def test_keeps_the_report_and_what_it_was_learned_from(tmp_path):
+def test_keeps_the_report_and_what_it_was_learned_from(fitted, tmp_path):
+    fitted.save(tmp_path / "a")
+    report = latentds.load(tmp_path / "a", classes=[FDM, SDSEF]).fit_report
+    assert type(report) is type(fitted.fit_report)
+    assert report == fitted.fit_report
+
+
+def test_the_report_names_its_demonstrations(tmp_path):
     shown = datasets.unstable_spiral(1, 100)
-    ds = TubeDS(3, n_layers=20, refined=False).fit(shown)
-    ds.save(tmp_path / "a")
-    report = latentds.load(tmp_path / "a").fit_report
-    assert (report.mse, report.n_layers, report.seconds) == (ds.fit_report.mse, 20, ds.fit_report.seconds)
-    assert report.learned_from == (shown.fingerprint,) == (("unstable c=1", shown.fingerprint[1]),)
-    ChebyshevDS(2).save(tmp_path / "b")
-    assert latentds.load(tmp_path / "b").fit_report is None
+    ChebyshevDS(3, n_layers=5).fit(shown).save(tmp_path / "a")
+    assert latentds.load(tmp_path / "a").fit_report.learned_from == (shown.fingerprint,)
+    assert shown.fingerprint[0] == "unstable c=1"
+
+
+@dataclass(frozen=True)
+class Detail:
+    worst: float
+    where: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class RichReport(FitReport):
+    follows: bool | None = None
+    detail: Detail | None = None
+    pair: tuple[str, int] = ("", 0)
+
+
+def test_a_third_partys_report_comes_back(tmp_path):
+    ds = Reports(2)
+    for report in (
+        RichReport(1.0, 2, math.inf, (1.0, math.nan), ("ü",)),
+        RichReport(0.1, 2, 0.0, follows=False, detail=Detail(0.1 + 0.2, (1, 2.5)), pair=("a", 3)),
+    ):
+        ds.fit_report = report
+        ds.save(tmp_path / "a")
+        back = latentds.load(tmp_path / "a", classes=[Reports]).fit_report
+        assert type(back) is RichReport
+        assert repr(back) == repr(report).replace("(1, 2.5)", "(1.0, 2.5)")
 
 
 def test_fingerprint_tells_demonstrations_apart():
@@ -108,14 +141,27 @@ def test_third_parties_by_explicit_argument(tmp_path):
         latentds.load(tmp_path / "fdm")
 
 
+class Reports(Mine):
+    report_type = RichReport
+
+
 class Forgets(Mine):
     def __init__(self, dim, *, gain=1.0):
         super().__init__(dim)
 
 
 def test_save_refuses_what_it_could_not_load(tmp_path):
-    for ds in (Forgets(2), Mine(2, rate=torch.ones(1)), Mine(2, rate=[1.0])):
-        with pytest.raises(ValueError, match="ds: expected plain constructor arguments kept as attributes"):
+    reported, told = Mine(2), Mine(2)
+    reported.fit_report = TubeReport(0.0, 1, 0.0)
+    told.fit_report = FitReport(torch.zeros(()), 1, 0.0)
+    for ds, message in {
+        Forgets(2): "expected constructor arguments kept as attributes of the same names, got none for gain",
+        Mine(2, rate=torch.ones(1)): r"expected numbers, .* as settings, got rate=tensor\(\[1\.\]\)",
+        Mine(2, rate=[1.0]): r"expected numbers, .* as settings, got rate=\[1\.0\]",
+        reported: r"expected a fit_report of Mine\.report_type, FitReport, got TubeReport",
+        told: "expected a fit_report of numbers, .* got Object of type Tensor",
+    }.items():
+        with pytest.raises(ValueError, match=f"ds: {message}"):
             ds.save(tmp_path / "a")
     assert not os.listdir(tmp_path)
 
@@ -205,7 +251,20 @@ BAD = {
     ),
     "nan": (lambda p: written(p, state={"attractor": torch.full((2,), torch.nan)}), "expected finite numbers, got NaN"),
     "bad report": (lambda p: written(p, report={"mse": "x"}), "does not hold a system"),
-    "odd report": (lambda p: written(p, report=[1]), "does not hold a system"),
+    "odd report": (lambda p: written(p, report=[1]), "report: expected .*FitReport.*, got \\[1\\]"),
+    "no report": (lambda p: written(p, report=...), "does not hold a system .* 'report'"),
+    "another method's report": (
+        lambda p: written(p, report=asdict(TubeReport(0.0, 1, 0.0))),
+        "report: expected the fields of FitReport, got unknown or missing ones: .'condition_path', .*'isotopy'",
+    ),
+    "half a report": (
+        lambda p: written(p, report={"mse": 0.0}),
+        "report: expected the fields of FitReport, .*: .'history', .*'seconds'",
+    ),
+    "mistyped report": (
+        lambda p: written(p, report=asdict(FitReport(0.0, 1, "soon"))),
+        "seconds: expected <class 'float'>, got 'soon'",
+    ),
 }
 
 

@@ -98,6 +98,7 @@ class TubeDS(LatentDS):
 
     diffeomorphism: LocallyWeightedTranslations
     dynamics: TubeDynamics
+    report_type = TubeReport
 
     def __init__(self, dim: int, *, n_layers: int = 300, contraction: float = 20.0, refined: bool = True) -> None:
         along, across = PiecewiseLinearLaw.uniform(), PiecewiseLinearLaw(torch.ones(1), torch.ones(1))
