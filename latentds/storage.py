@@ -12,6 +12,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
+import safetensors.torch
 import torch
 
 from .base import StableDS
@@ -34,9 +35,7 @@ def save(ds: StableDS, path: str | os.PathLike[str]) -> None:
 
     Raises:
         ValueError: if ``ds`` is no such system.
-        ImportError: if safetensors is missing; it comes with ``pip install 'latentds[files]'``.
     """
-    safetensors = _safetensors()
     if not isinstance(ds, StableDS):
         raise ValueError(f"ds: expected a StableDS, got {type(ds).__name__}")
     if lost := [name for name in inspect.signature(type(ds)).parameters if not hasattr(ds, name)]:
@@ -76,9 +75,7 @@ def load(path: str | os.PathLike[str], *, classes: Sequence[type[StableDS]] = ()
     Raises:
         ValueError: if the file is damaged, of another kind, of a newer format, or holds another class.
         FileNotFoundError: if there is no such file.
-        ImportError: if safetensors is missing; it comes with ``pip install 'latentds[files]'``.
     """
-    safetensors = _safetensors()
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"path: no such file: {path}")
@@ -146,13 +143,3 @@ def _typed(told: Any, wanted: Any, name: str) -> Any:
     if type(told) is not wanted and (type(told), wanted) != (int, float):
         raise ValueError(f"{name}: expected {wanted}, got {told!r:.80}")
     return wanted(told)
-
-
-def _safetensors() -> Any:
-    try:
-        import safetensors
-        import safetensors.torch
-    except ImportError:
-        raise ImportError("saving and loading need safetensors: pip install 'latentds[files]'") from None
-
-    return safetensors

@@ -7,8 +7,6 @@ import math
 import os
 import pickle
 import struct
-import subprocess
-import sys
 from dataclasses import asdict, dataclass
 
 import pytest
@@ -313,15 +311,3 @@ def test_a_save_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
         ChebyshevDS(3).save(path)
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["a"]
-
-
-def test_without_safetensors_the_error_says_what_to_install(tmp_path):
-    code = (
-        "import sys; sys.modules['safetensors'] = None\n"
-        "import latentds\n"
-        "for call in (lambda: latentds.ChebyshevDS(2).save('a'), lambda: latentds.load('a')):\n"
-        "    try: call()\n"
-        "    except ImportError as error: print(error)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert done.stdout.count("need safetensors: pip install 'latentds[files]'") == 2
