@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import inspect
+import json
 import math
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, TypeVar
 
 import torch
@@ -19,6 +20,10 @@ from .deploy.controller import Controller
 from .deploy.tables import FieldTables, field_tables
 from .diffeomorphism import Diffeomorphism
 from .dynamics import LatentDynamics
+from .files import write_tensors
+
+FORMAT = 2
+"""Of the files of systems; raised when they change so that another latentds would misread them."""
 
 Self = TypeVar("Self", bound="StableDS")
 
@@ -102,10 +107,30 @@ class StableDS(nn.Module, ABC):
         return {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write one file that :func:`latentds.load` reads, atomically; see :mod:`latentds.storage`."""
-        from .storage import save
+        """Write the system, its :attr:`settings` and its ``fit_report`` to one file that :func:`latentds.load` reads.
 
-        save(self, path)
+        Atomic: the file is there whole or not at all.
+
+        Raises:
+            ValueError: if a setting is no number, string, boolean or None, if the report is not of ``report_type``,
+                or if something other than a regular file is at ``path``.
+        """
+        if lost := [name for name in inspect.signature(type(self)).parameters if not hasattr(self, name)]:
+            raise ValueError(f"ds: expected constructor arguments kept as attributes, got none for {', '.join(lost)}")
+        settings, report = self.settings, self.fit_report
+        for name, value in settings.items():
+            if not isinstance(value, (int, float, str, type(None))):
+                raise ValueError(f"ds: expected settings of numbers, strings or None, got {name}={value!r:.80}")
+        if report is not None and type(report) is not self.report_type:
+            raise ValueError(
+                f"ds: expected a fit_report of report_type {self.report_type.__name__}, got {type(report).__name__}"
+            )
+        told = {"format": FORMAT, "class": type(self).__name__, "settings": settings}
+        try:
+            about = json.dumps(told | {"report": None if report is None else asdict(report)})
+        except TypeError as error:
+            raise ValueError(f"ds: expected a fit_report of numbers, strings and tuples, got {error}") from None
+        write_tensors(path, self.state_dict(), about)
 
     def _points(self, y: Any, name: str = "y") -> tuple[Tensor, torch.dtype]:
         """``y`` in the module's dtype, and the dtype in which the caller wants the answer."""

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import os
-import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from . import files
 from .arguments import point_array, positive, real_array
 
-MAX_BYTES = 2**30
-"""Largest file of a demonstration that is read, unpacked: a hostile one could name any size."""
 CLOSED = 1e-6
 """Distance of the goal from the start, in sizes of the motion, up to which it counts as a closed loop."""
 
@@ -138,12 +137,10 @@ class Demonstration:
         A CSV has one header line and one row per point; its first column is ``t`` in seconds.
 
         Raises:
-            ValueError: if the file is neither, is damaged, or does not hold a demonstration.
+            ValueError: if the file is neither, is damaged, holds more than 1 GiB, or does not hold a demonstration.
             FileNotFoundError: if there is no such file.
         """
         path = Path(path)
-        if not path.exists():
-            raise FileNotFoundError(f"path: no such file: {path}")
         if path.suffix == ".npz":
             return cls._from_npz(path)
         if path.suffix == ".csv":
@@ -152,11 +149,12 @@ class Demonstration:
 
     @classmethod
     def _from_npz(cls, path: Path) -> Demonstration:
+        data = files.read_file(path)
         try:
-            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            with np.load(io.BytesIO(data), allow_pickle=False) as file:
                 size = sum(entry.file_size for entry in file.zip.infolist())  # unpacked
-                if size > MAX_BYTES:
-                    raise ValueError(f"holds {size:g} bytes, more than {MAX_BYTES:g}")
+                if size > files.MAX_BYTES:
+                    raise ValueError(f"holds {size} bytes, more than {files.MAX_BYTES}")
                 arrays = {key: file[key] for key in file.files if key in ("positions", "dt", "times", "name")}
         except Exception as error:
             raise ValueError(f"path: {path.name} is not a readable .npz without pickles ({error})") from None
@@ -173,10 +171,9 @@ class Demonstration:
 
     @classmethod
     def _from_csv(cls, path: Path) -> Demonstration:
+        data = files.read_file(path)
         try:
-            if (size := path.stat().st_size) > MAX_BYTES:
-                raise ValueError(f"holds {size:g} bytes, more than {MAX_BYTES:g}")
-            header, *rows = path.read_text(encoding="utf-8").splitlines() or [""]
+            header, *rows = data.decode("utf-8").splitlines() or [""]
             columns = header.split(",")
             table = np.loadtxt(rows, delimiter=",", ndmin=2) if rows else np.empty((0, len(columns)))
         except (ValueError, UnicodeDecodeError) as error:
@@ -192,35 +189,13 @@ class Demonstration:
         path = Path(path)
         if path.suffix not in (".npz", ".csv"):
             raise ValueError(f"path: expected a .npz or .csv file, got {path.name!r}")
-        with atomic_write(path) as file:
+        with files.atomic_write(path) as file:
             if path.suffix == ".npz":
                 np.savez(file, positions=self.positions.numpy(), dt=self.dt, name=self.name)
             else:
                 columns = ["t", *(f"y{i}" for i in range(self.dim))]
                 table = np.column_stack([self.times.numpy(), self.positions.numpy()])
                 np.savetxt(file, table, delimiter=",", header=",".join(columns), comments="", fmt="%.17g")
-
-
-class atomic_write:
-    """Open a binary file that takes its place under ``path`` only when the block ends without an error."""
-
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path)
-
-    def __enter__(self) -> IO[bytes]:
-        # Not by tempfile, whose files nobody else may read even after they took their place.
-        self.file = open(self.path.with_name(f".{self.path.name}.{secrets.token_hex(8)}"), "xb")
-        return self.file
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            self.file.flush()
-            os.fsync(self.file.fileno())
-        self.file.close()
-        if kind is None:
-            os.replace(self.file.name, self.path)
-        else:
-            os.unlink(self.file.name)
 
 
 def demonstrations_of(demonstration: Any, dim: int) -> list[Demonstration]:

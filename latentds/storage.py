@@ -1,4 +1,4 @@
-"""Systems in files: safetensors, with JSON beside the numbers. Loading runs and imports nothing that a file names."""
+"""Systems from files: safetensors, with JSON beside the numbers. Loading runs and imports nothing that a file names."""
 
 from __future__ import annotations
 
@@ -7,63 +7,24 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-import safetensors.torch
 import torch
 
-from .base import StableDS
-from .demonstration import atomic_write
+from .base import FORMAT, StableDS
+from .files import read_tensors
 from .methods.chebyshev import ChebyshevDS
 from .methods.tube import TubeDS
 
-FORMAT = 1
-"""Raised when files change so that an older latentds would misread them."""
 SLACK = 1000
 """A file may ask for this many times as many numbers as it holds, not more: its sizes are not to be trusted."""
 
 
-def save(ds: StableDS, path: str | os.PathLike[str]) -> None:
-    """Write a system, its constructor's arguments and its fit's report to one file. Atomic.
-
-    Args:
-        ds: a system whose :attr:`~latentds.StableDS.settings` are numbers, strings, booleans or None.
-        path: of the file.
-
-    Raises:
-        ValueError: if ``ds`` is no such system.
-    """
-    if not isinstance(ds, StableDS):
-        raise ValueError(f"ds: expected a StableDS, got {type(ds).__name__}")
-    if lost := [name for name in inspect.signature(type(ds)).parameters if not hasattr(ds, name)]:
-        raise ValueError(
-            f"ds: expected constructor arguments kept as attributes of the same names, got none for {', '.join(lost)}"
-        )
-    settings = ds.settings
-    for name, value in settings.items():
-        if not isinstance(value, (int, float, str, type(None))):
-            raise ValueError(f"ds: expected numbers, strings, booleans or None as settings, got {name}={value!r:.80}")
-    report = ds.fit_report
-    if report is not None and type(report) is not ds.report_type:
-        kind = type(ds).__name__
-        raise ValueError(
-            f"ds: expected a fit_report of {kind}.report_type, {ds.report_type.__name__}, got {type(report).__name__}"
-        )
-    told = None if report is None else asdict(report)
-    try:
-        text = json.dumps({"format": FORMAT, "class": type(ds).__name__, "settings": settings, "report": told})
-    except TypeError as error:
-        raise ValueError(f"ds: expected a fit_report of numbers, strings, booleans and tuples, got {error}") from None
-    state = {name: value.detach().cpu().contiguous() for name, value in ds.state_dict().items()}
-    with atomic_write(path) as file:
-        file.write(safetensors.torch.save(state, metadata={"latentds": text}))
-
-
 def load(path: str | os.PathLike[str], *, classes: Sequence[type[StableDS]] = ()) -> StableDS:
-    """Read a system that :func:`save` wrote, from a source that need not be trusted.
+    """Read a system that :meth:`StableDS.save` wrote, from a source that need not be trusted.
 
     Nothing that the file names is imported or run: its class is looked up by name among ChebyshevDS, TubeDS and
     ``classes``. Whether what was loaded is stable is for :func:`latentds.certify` to say.
@@ -76,50 +37,43 @@ def load(path: str | os.PathLike[str], *, classes: Sequence[type[StableDS]] = ()
         ValueError: if the file is damaged, of another kind, of a newer format, or holds another class.
         FileNotFoundError: if there is no such file.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"path: no such file: {path}")
-    try:
-        with safetensors.safe_open(path, "pt") as file:
-            text = (file.metadata() or {}).get("latentds")
-            state = {name: file.get_tensor(name) for name in file.keys()} if text is not None else {}  # noqa: SIM118
-    except Exception as error:  # safetensors' own errors, and whatever a hostile header provokes
-        raise ValueError(f"path: {path.name} is not a readable safetensors file ({error})") from None
+    text, state = read_tensors(path)
     known: dict[str, type[StableDS]] = {"ChebyshevDS": ChebyshevDS, "TubeDS": TubeDS}
     known |= {allowed.__name__: allowed for allowed in classes}
-    if text is None:
-        raise ValueError(f"path: expected a file that latentds wrote, got another safetensors file: {path.name}")
     try:
         return _rebuilt(text, state, known)
     except (KeyError, TypeError, RuntimeError, AttributeError, RecursionError, ValueError) as error:
         reason = " ".join(str(error).split())
-        raise ValueError(f"path: {path.name} does not hold a system that can be loaded: {reason}") from None
+        raise ValueError(f"path: {Path(path).name} does not hold a system that can be loaded: {reason}") from None
 
 
 def _rebuilt(text: str, state: dict[str, torch.Tensor], known: dict[str, type[StableDS]]) -> StableDS:
     told = json.loads(text)
     if not isinstance(told, dict) or type(told.get("format")) is not int:
         raise ValueError("expected a format number in its metadata, got none")
-    if told["format"] > FORMAT:
-        raise ValueError(f"expected format {FORMAT} or older, got {told['format']}: it needs a newer latentds")
+    if told["format"] != FORMAT:
+        age = "a newer" if told["format"] > FORMAT else "an older"
+        raise ValueError(f"expected format {FORMAT}, got {told['format']}: it needs {age} latentds")
     if told["class"] not in known:
         raise ValueError(
             f"expected a class among {sorted(known)}, got {told['class']!r:.80}; allow others by classes=[…]"
         )
     settings = told["settings"]
     wanted = inspect.signature(known[told["class"]]).parameters
-    if not isinstance(settings, dict) or not set(settings) <= set(wanted):
-        raise ValueError(f"expected settings among {sorted(wanted)}, got {settings!r:.200}")
+    if not isinstance(settings, dict) or set(settings) != set(wanted):
+        raise ValueError(f"expected the settings {sorted(wanted)}, got {settings!r:.200}")
     held = sum(value.numel() for value in state.values())
     sizes = [v for k, v in settings.items() if (k == "dim" or k.startswith("n_")) and isinstance(v, int)]
     if math.prod(max(size, 1) for size in sizes) > SLACK * max(held, 1):
         raise ValueError(f"expected sizes that {held} stored numbers can fill, got {settings!r:.200}")
     if not all(bool(torch.isfinite(value).all()) for value in state.values() if value.is_floating_point()):
         raise ValueError("expected finite numbers, got NaN or inf")
+    if any(value.is_complex() for value in state.values()):
+        raise ValueError("expected real numbers, got complex ones")
     with torch.random.fork_rng(devices=[]):  # an unseeded constructor draws numbers, only to have them replaced
         ds = known[told["class"]](**settings)
     dtype = state["attractor"].dtype
-    if not dtype.is_floating_point:
+    if dtype not in (torch.float64, torch.float32, torch.float16, torch.bfloat16):
         raise ValueError(f"expected a floating attractor, got {dtype}")
     ds.to(dtype).load_state_dict(state)
     ds.fit_report = None if told["report"] is None else _typed(told["report"], ds.report_type, "report")

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from latentds import Demonstration
-from latentds.demonstration import atomic_write, demonstrations_of, only_demonstration
+from latentds.demonstration import demonstrations_of, only_demonstration
 
 
 @pytest.fixture
@@ -222,12 +222,12 @@ def test_damaged_files(tmp_path, name):
 
 
 def test_a_zip_bomb_is_not_unpacked(tmp_path, monkeypatch):
-    monkeypatch.setattr("latentds.demonstration.MAX_BYTES", 10**5)
+    monkeypatch.setattr("latentds.files.MAX_BYTES", 10**5)
     np.savez_compressed(tmp_path / "bomb.npz", positions=np.zeros((10**5, 3)), dt=1.0)
     assert (tmp_path / "bomb.npz").stat().st_size < 10**4
     (tmp_path / "long.csv").write_text("t,y\n" + "0,0\n" * 10**5)
     for name in ("bomb.npz", "long.csv"):
-        with pytest.raises(ValueError, match=f"{name} .*holds .* bytes, more than 100000"):
+        with pytest.raises(ValueError, match=f"^path: {name} .*holds .* bytes, more than 100000"):
             Demonstration.load(tmp_path / name)
 
 
@@ -256,25 +256,14 @@ def test_save_refuses_other_suffixes(shown, tmp_path):
         shown.save(tmp_path / "a.pkl")
 
 
-def test_a_write_that_fails_leaves_the_old_file(tmp_path):
-    path = tmp_path / "a.npz"
-    path.write_bytes(b"old")
-
-    def write_half():
-        with atomic_write(path) as file:
-            file.write(b"new")
-            raise RuntimeError("stop")
-
-    with pytest.raises(RuntimeError, match="stop"):
-        write_half()
-    assert path.read_bytes() == b"old"
-    assert os.listdir(tmp_path) == ["a.npz"]
-
-
-def test_written_file_has_the_usual_permissions(shown, tmp_path):
-    shown.save(tmp_path / "a.npz")
-    (tmp_path / "b").write_bytes(b"")
-    assert (tmp_path / "a.npz").stat().st_mode == (tmp_path / "b").stat().st_mode
+@pytest.mark.parametrize("suffix", [".npz", ".csv"])
+def test_what_is_no_file_is_refused_before_reading(tmp_path, suffix):
+    os.mkfifo(tmp_path / f"fifo{suffix}")
+    (tmp_path / f"endless{suffix}").symlink_to("/dev/zero")
+    (tmp_path / f"folder{suffix}").mkdir()
+    for name in ("fifo", "endless", "folder"):
+        with pytest.raises(ValueError, match=f"path: expected a regular file, got a .*{name}"):
+            Demonstration.load(tmp_path / f"{name}{suffix}")
 
 
 def test_demonstrations_of(shown):

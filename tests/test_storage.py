@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
 import pickle
 import struct
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 
 import pytest
@@ -153,10 +156,10 @@ def test_save_refuses_what_it_could_not_load(tmp_path):
     reported.fit_report = TubeReport(0.0, 1, 0.0)
     told.fit_report = FitReport(torch.zeros(()), 1, 0.0)
     for ds, message in {
-        Forgets(2): "expected constructor arguments kept as attributes of the same names, got none for gain",
-        Mine(2, rate=torch.ones(1)): r"expected numbers, .* as settings, got rate=tensor\(\[1\.\]\)",
-        Mine(2, rate=[1.0]): r"expected numbers, .* as settings, got rate=\[1\.0\]",
-        reported: r"expected a fit_report of Mine\.report_type, FitReport, got TubeReport",
+        Forgets(2): "expected constructor arguments kept as attributes, got none for gain",
+        Mine(2, rate=torch.ones(1)): r"expected settings of numbers, strings or None, got rate=tensor\(\[1\.\]\)",
+        Mine(2, rate=[1.0]): r"expected settings of numbers, strings or None, got rate=\[1\.0\]",
+        reported: "expected a fit_report of report_type FitReport, got TubeReport",
         told: "expected a fit_report of numbers, .* got Object of type Tensor",
     }.items():
         with pytest.raises(ValueError, match=f"ds: {message}"):
@@ -224,13 +227,18 @@ BAD = {
     "deep JSON": (lambda p: written(p, text="[" * 100_000), "does not hold a system"),
     "a list": (lambda p: written(p, text="[1, 2]"), "expected a format number in its metadata"),
     "no format": (lambda p: written(p, format=...), "expected a format number in its metadata"),
-    "newer": (lambda p: written(p, format=FORMAT + 1), f"got {FORMAT + 1}: it needs a newer latentds"),
+    "newer": (
+        lambda p: written(p, format=FORMAT + 1),
+        f"expected format 2, got {FORMAT + 1}: it needs a newer latentds",
+    ),
+    "older": (lambda p: written(p, format=1), "expected format 2, got 1: it needs an older latentds"),
     "no class": (lambda p: written(p, **{"class": ...}), "does not hold a system .* 'class'"),
     "a module's class": (lambda p: written(p, **{"class": "os.system"}), "expected a class among .*, got 'os.system'"),
     "unhashable class": (lambda p: written(p, **{"class": ["FDM"]}), "does not hold a system"),
     "no settings": (lambda p: written(p, settings=...), "does not hold a system .* 'settings'"),
-    "odd settings": (lambda p: written(p, settings=[2]), "expected settings among"),
-    "unknown setting": (lambda p: written(p, settings=settings(callback="os.system")), "expected settings among"),
+    "odd settings": (lambda p: written(p, settings=[2]), "expected the settings"),
+    "missing setting": (lambda p: written(p, settings={"dim": 2, "n_layers": 3}), "expected the settings .'beta', .*"),
+    "unknown setting": (lambda p: written(p, settings=settings(callback="os.system")), "expected the settings"),
     "bad setting": (lambda p: written(p, settings=settings(beta=7)), "beta: expected a number in"),
     "absurd dim": (
         lambda p: written(p, settings=settings(dim=10**12)),
@@ -246,6 +254,18 @@ BAD = {
     "whole numbers": (
         lambda p: written(p, state={"attractor": torch.ones(2, dtype=torch.int64)}),
         "floating attractor",
+    ),
+    "eight bits": (
+        lambda p: written(p, state={"attractor": torch.ones(2).to(torch.float8_e5m2)}),
+        "floating attractor",
+    ),
+    "complex numbers": (
+        lambda p: written(p, state={"attractor": torch.ones(2, dtype=torch.complex64)}),
+        "expected real numbers, got complex",
+    ),
+    "a complex layer": (
+        lambda p: written(p, state={"dynamics.length": torch.ones((), dtype=torch.complex64)}),
+        "expected real numbers, got complex",
     ),
     "nan": (lambda p: written(p, state={"attractor": torch.full((2,), torch.nan)}), "expected finite numbers, got NaN"),
     "bad report": (lambda p: written(p, report={"mse": "x"}), "does not hold a system"),
@@ -300,6 +320,31 @@ def test_every_truncation_is_a_clear_error(tmp_path):
 def test_missing_file(tmp_path):
     with pytest.raises(FileNotFoundError, match="path: no such file"):
         latentds.load(tmp_path / "nothing")
+
+
+def test_a_load_beside_a_writer_gives_one_system_whole(tmp_path):
+    path, done = tmp_path / "a", threading.Event()
+
+    def replace(values):
+        for value in values:
+            ds = ChebyshevDS(2, n_layers=3, beta=value)
+            ds.attractor.fill_(value)
+            ds.dynamics.length.fill_(value)
+            ds.save(path)
+            if done.is_set():
+                return
+
+    replace([0.5])
+    with ThreadPoolExecutor(2) as pool:
+        writers = [pool.submit(replace, itertools.cycle((0.25, 0.75))) for _ in range(2)]
+        try:
+            for _ in range(300):
+                ds = latentds.load(path)
+                assert [ds.beta, *ds.attractor.tolist(), ds.dynamics.length.item()] == [ds.beta] * 4
+        finally:
+            done.set()
+        for writer in writers:
+            writer.result()
 
 
 def test_a_save_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
