@@ -31,7 +31,7 @@ Rows = tuple[dict[str, Any], ...]
 _APPLICATION = 0x6C617464  # "latd": tells our files from other SQLite files
 _SCHEMA = """CREATE TABLE IF NOT EXISTS cells (
     key TEXT PRIMARY KEY, method TEXT NOT NULL, demonstration TEXT NOT NULL, seed INTEGER NOT NULL,
-    rows TEXT NOT NULL, paths BLOB NOT NULL
+    rows TEXT NOT NULL, paths BLOB NOT NULL, digest BLOB NOT NULL
 ) WITHOUT ROWID"""
 
 
@@ -42,24 +42,33 @@ class CellStore:
         path: of the file; made if absent. On a local disk: SQLite's write-ahead log needs shared memory.
 
     Raises:
-        ValueError: if the file holds something else.
+        ValueError: if the file holds something else, or is damaged; that may show only in what reads it.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
+        if self.path.exists() and not self.path.is_file():
+            raise self._refusal("no regular file")
         try:
             self._connection = sqlite3.connect(self.path, timeout=60, isolation_level=None)
-            self._open()
         except sqlite3.DatabaseError as error:
-            raise ValueError(f"store: expected a file of finished cells, got {self.path} ({error})") from None
+            raise self._refusal(error) from None
+        ours = self._execute("PRAGMA application_id")[0][0] == _APPLICATION
+        if not ours and self._execute("SELECT 1 FROM sqlite_master"):
+            raise self._refusal("a database of another kind")
+        self._execute("PRAGMA journal_mode = WAL")
+        self._execute(f"PRAGMA application_id = {_APPLICATION}")
+        self._execute(_SCHEMA)
+        self._execute("SELECT key, method, demonstration, seed, rows, paths, digest FROM cells LIMIT 0")
 
-    def _open(self) -> None:
-        ours = self._connection.execute("PRAGMA application_id").fetchone()[0] == _APPLICATION
-        if not ours and self._connection.execute("SELECT 1 FROM sqlite_master").fetchone():
-            raise sqlite3.DatabaseError("a database of another kind")
-        self._connection.execute("PRAGMA journal_mode = WAL")
-        self._connection.execute(f"PRAGMA application_id = {_APPLICATION}")
-        self._connection.execute(_SCHEMA)
+    def _execute(self, command: str, values: tuple[Any, ...] = ()) -> list[Any]:
+        try:
+            return self._connection.execute(command, values).fetchall()
+        except sqlite3.DatabaseError as error:
+            raise self._refusal(error) from None
+
+    def _refusal(self, reason: object) -> ValueError:
+        return ValueError(f"store: expected a file of finished cells, got {self.path} ({reason})")
 
     def __enter__(self) -> CellStore:
         return self
@@ -68,26 +77,32 @@ class CellStore:
         self._connection.close()
 
     def __len__(self) -> int:
-        return int(self._connection.execute("SELECT count(*) FROM cells").fetchone()[0])
+        return int(self._execute("SELECT count(*) FROM cells")[0][0])
 
     def keys(self) -> set[str]:
-        return {key for (key,) in self._connection.execute("SELECT key FROM cells")}
+        return {key for (key,) in self._execute("SELECT key FROM cells")}
 
     def get(self, key: str) -> tuple[Rows, NDArray[np.float64]] | None:
         """The rows and rollouts of a cell, or None if it was not finished."""
-        found = self._connection.execute("SELECT rows, paths FROM cells WHERE key = ?", (key,)).fetchone()
-        if found is None:
+        found = self._execute("SELECT rows, paths, digest FROM cells WHERE key = ?", (key,))
+        if not found:
             return None
-        return tuple(json.loads(found[0])), np.load(io.BytesIO(found[1]), allow_pickle=False)
+        rows, paths, digest = found[0]
+        if not isinstance(rows, str) or not isinstance(paths, bytes) or digest != _digest(key, rows, paths):
+            raise self._refusal("a damaged cell")
+        return tuple(json.loads(rows)), np.load(io.BytesIO(paths), allow_pickle=False)
 
     def put(self, key: str, rows: Rows, paths: NDArray[np.float64]) -> None:
         """Keep a finished cell; the first to come stays."""
         packed = io.BytesIO()
         np.save(packed, paths, allow_pickle=False)
-        named = (rows[0]["method"], rows[0]["demonstration"], rows[0]["seed"])
-        self._connection.execute(
-            "INSERT OR IGNORE INTO cells VALUES (?, ?, ?, ?, ?, ?)", (key, *named, json.dumps(rows), packed.getvalue())
-        )
+        named, told = (rows[0]["method"], rows[0]["demonstration"], rows[0]["seed"]), json.dumps(rows)
+        kept = (key, *named, told, packed.getvalue(), _digest(key, told, packed.getvalue()))
+        self._execute("INSERT OR IGNORE INTO cells VALUES (?, ?, ?, ?, ?, ?, ?)", kept)
+
+
+def _digest(key: str, rows: str, paths: bytes) -> bytes:
+    return hashlib.sha256(f"{key}{rows}".encode() + paths).digest()
 
 
 class UnreadableError(ValueError):

@@ -366,6 +366,42 @@ def test_a_file_of_another_kind_is_refused(file):
         CellStore(file.parent / "nowhere" / "cells.sqlite")
 
 
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir, lambda path: os.symlink("/dev/zero", path)])
+def test_what_is_no_file_is_refused(file, make):
+    make(file)
+    with pytest.raises(ValueError, match=r"^store: expected a file of finished cells, got .*regular file"):
+        CellStore(file)
+
+
+def test_a_damaged_store_gives_what_it_got_or_one_clear_error(file, tmp_path):
+    draw = np.random.default_rng(0)
+    kept = {f"key {i}": ({"method": "m", "demonstration": "d", "seed": i, "dtw": i / 3},) for i in range(40)}
+    paths = draw.standard_normal((3, 100, 3))
+    with CellStore(file) as cells:
+        for key, rows in kept.items():
+            cells.put(key, rows, paths)
+    whole, refused = file.read_bytes(), []
+    for place in [*draw.integers(0, len(whole), 60), 0, 20, 100, len(whole) - 1]:
+        damaged = tmp_path / "damaged"
+        damaged.write_bytes(whole[:place] + draw.bytes(min(500, len(whole) - place)) + whole[place + 500 :])
+        try:
+            with CellStore(damaged) as cells:
+                for key in kept.keys() & cells.keys():
+                    if (found := cells.get(key)) is not None:
+                        assert found[0] == kept[key]
+                        assert np.array_equal(found[1], paths)
+        except ValueError as error:
+            refused.append(str(error))
+    assert len(refused) > 10
+    assert all(text.startswith(f"store: expected a file of finished cells, got {damaged} (") for text in refused)
+    (tmp_path / "half").write_bytes(whole[: len(whole) // 2])
+    with (
+        pytest.raises(ValueError, match=r"^store: expected a file of finished cells"),
+        CellStore(tmp_path / "half") as cells,
+    ):
+        assert [cells.get(key) for key in kept]
+
+
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
 def test_killed_runs_lose_nothing():
     kill.main(kills=3, seed=1, n_seeds=8)
