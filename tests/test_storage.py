@@ -20,9 +20,9 @@ import latentds
 from baselines import FDM, SDSEF
 from latentds import ChebyshevDS, Demonstration, StableDS, TubeDS, datasets
 from latentds.base import FitReport
+from latentds.methods.tube import TubeReport
 from latentds.storage import FORMAT
 from latentds.testing import wavy_motion
-from latentds.tube import TubeReport
 
 SYSTEMS = {
     "ChebyshevDS": lambda: ChebyshevDS(3, n_layers=40, beta=0.7, mu=0.8),
