@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from latentds.arguments import whole_number
 from latentds.base import FitReport, LatentDS
 from latentds.demonstration import Demonstration, demonstrations_of
-from latentds.dynamics import LatentDynamics
+from latentds.dynamics import LatentDynamics, check_positive
 
 from .couplings import AffineCouplings
 from .training import Plan, Training, descend
@@ -186,6 +186,11 @@ class NormalizedDescent(LatentDynamics):
     def convergence_rate_bound(self, radius: float) -> float:
         slowest = float(torch.exp(self.log_speed_range[0]) / self.duration)
         return slowest / max(radius, GUARD * float(self.length))
+
+    def check_buffers(self, buffers: Mapping[str, Tensor]) -> None:
+        check_positive(buffers, "length", "duration")
+        if (ends := buffers.get("log_speed_range")) is not None and not bool((ends.diff() >= 0).all()):
+            raise ValueError(f"log_speed_range: expected its lower end first, got {ends.tolist()}")
 
     def _stretch(self, r: Tensor) -> Tensor:
         """w(r): log(r/ε) below the guard ε, r/ε - 1 up to FAR lengths, then 100 asinh of a hundredth of the rest."""

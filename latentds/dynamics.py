@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +14,9 @@ from torch import Tensor, nn
 from .time_law import TimeLaw
 
 Array = NDArray[np.float64]
+
+UNIT = 1e-6
+"""How far from 1 the length of an axis may be: as far as that of one that was in float32 once."""
 
 
 class LatentDynamics(nn.Module, ABC):
@@ -38,6 +43,22 @@ class LatentDynamics(nn.Module, ABC):
     def convergence_rate_bound(self, radius: float) -> float | None:
         """A lower bound on -V̇/(2V) within ``radius`` of x*, per second, that holds by construction; None if unknown."""
         return None
+
+    def check_buffers(self, buffers: Mapping[str, Tensor]) -> None:
+        """Refuse numbers for some of the buffers, by name, that no such dynamics can have: those of a file, say.
+
+        Raises:
+            ValueError: naming the buffer.
+        """
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        names = [name for name in self._buffers if prefix + name in state_dict]
+        try:
+            self.check_buffers({name: state_dict[prefix + name] for name in names})
+        except ValueError as error:
+            rest[-1].append(str(error))  # load_state_dict's list of what went wrong
+            return
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def tables(self) -> tuple[Array, Array, Array] | None:
         """(goal, along, across) of :class:`latentds.deploy.tables.FieldTables`; None if it cannot be written so."""
@@ -73,6 +94,9 @@ class RayDynamics(LatentDynamics):
 
     def convergence_rate_bound(self, radius: float) -> float:
         return self.law.convergence_rate_bound(radius / float(self.length))
+
+    def check_buffers(self, buffers: Mapping[str, Tensor]) -> None:
+        check_positive(buffers, "length")
 
     def tables(self) -> tuple[Array, Array, Array] | None:
         law = self.law.table() if type(self) is RayDynamics else None
@@ -126,6 +150,13 @@ class TubeDynamics(LatentDynamics):
         reach = radius / float(self.length)
         return min(self.law.convergence_rate_bound(reach), self.transverse_law.convergence_rate_bound(reach))
 
+    def check_buffers(self, buffers: Mapping[str, Tensor]) -> None:
+        check_positive(buffers, "length")
+        if (axis := buffers.get("axis")) is not None:
+            norm = float(torch.linalg.vector_norm(axis.to(self.axis.dtype).to(torch.float64)))
+            if not abs(norm - 1) <= max(UNIT, 4 * torch.finfo(self.axis.dtype).eps):
+                raise ValueError(f"axis: expected a vector of length 1, got one of length {norm:.9g}")
+
     def phase(self, x: Tensor) -> Tensor:
         """s, 1 at the demonstrated start and 0 at x*: (..., n) -> (...)."""
         return self._split(x)[0].squeeze(-1)
@@ -141,6 +172,13 @@ class TubeDynamics(LatentDynamics):
         offset = (x - self.attractor) / self.length
         along = (offset * self.axis).sum(-1, keepdim=True)
         return along, offset - along * self.axis
+
+
+def check_positive(buffers: Mapping[str, Tensor], *names: str) -> None:
+    """Refuse buffers of these names that are not above 0."""
+    for name in names:
+        if name in buffers and not bool((buffers[name] > 0).all()):
+            raise ValueError(f"{name}: expected a number > 0, got {buffers[name].tolist()}")
 
 
 def _goal_table(attractor: Tensor, axis: Tensor, length: Tensor) -> Array:

@@ -85,6 +85,13 @@ class ChebyshevLaw(TimeLaw):
     def convergence_rate_bound(self, reach: float) -> float:
         return float(self.speed(self.omega.new_tensor(reach))) / reach  # h(s)/s never rises
 
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        omega = state_dict.get(prefix + "omega")
+        if omega is not None and not bool((omega > 0).all()):
+            rest[-1].append(f"omega: expected a number > 0, got {omega.tolist()}")
+            return
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
     def table(self) -> NDArray[np.float64] | None:
         return np.array([[-1.0], [float(self.omega)]]) if type(self) is ChebyshevLaw else None
 
@@ -212,9 +219,9 @@ class PiecewiseLinearLaw(TimeLaw):
 def _check_knots(knots: Tensor, speeds: Tensor) -> None:
     increasing = knots.ndim == 1 and len(knots) > 0 and bool((knots.diff() > 0).all()) and float(knots[0]) > 0
     if not (increasing and bool(torch.isfinite(knots).all())):
-        raise ValueError(f"knots: expected (m,) finite numbers increasing from above 0, got {knots}")
+        raise ValueError(f"knots: expected (m,) finite numbers increasing from above 0, got {knots.tolist()!r:.80}")
     if speeds.shape != knots.shape or not bool(((speeds > 0) & torch.isfinite(speeds)).all()):
-        raise ValueError(f"speeds: expected {tuple(knots.shape)} finite numbers > 0, got {speeds}")
+        raise ValueError(f"speeds: expected {tuple(knots.shape)} finite numbers > 0, got {speeds.tolist()!r:.80}")
 
 
 def _travel_time(distance: Tensor, speed: Tensor, slope: Tensor) -> Tensor:

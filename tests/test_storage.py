@@ -14,14 +14,14 @@ from dataclasses import asdict, dataclass
 
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
 import latentds
 from baselines import FDM, SDSEF
 from latentds import ChebyshevDS, Demonstration, StableDS, TubeDS, datasets
-from latentds.base import FitReport
+from latentds.base import FORMAT, FitReport
+from latentds.files import read_tensors, write_tensors
 from latentds.methods.tube import TubeReport
-from latentds.storage import FORMAT
 from latentds.testing import wavy_motion
 
 SYSTEMS = {
@@ -296,16 +296,56 @@ def test_bad_files(tmp_path, monkeypatch, name):
     assert os.listdir(tmp_path) == ["bad"]
 
 
-def test_a_law_whose_knots_do_not_increase_is_refused(tmp_path):
-    ds = TubeDS(2, n_layers=3)
+def changed(path, ds, **tensors):
+    """A genuine file with some of its tensors replaced."""
+    ds.save(path)
+    about, state = read_tensors(path)
+    assert state.keys() >= tensors.keys()
+    write_tensors(path, state | {name: torch.as_tensor(value) for name, value in tensors.items()}, about)
+
+
+NO_SYSTEM = [
+    (TubeDS, {"dynamics.axis": [1.0001, 0.0]}, "axis: expected a vector of length 1, got one of length 1.0001"),
+    (TubeDS, {"dynamics.axis": [0.0, 0.0]}, "axis: expected a vector of length 1, got one of length 0"),
+    (TubeDS, {"dynamics.axis": [2, 0]}, "axis: expected a vector of length 1, got one of length 2"),
+    (TubeDS, {"dynamics.length": 0.0}, r"length: expected a number > 0, got 0\.0"),
+    (ChebyshevDS, {"dynamics.length": -1.0}, r"length: expected a number > 0, got -1\.0"),
+    (FDM, {"dynamics.length": 0.0}, r"length: expected a number > 0, got 0\.0"),
+    (SDSEF, {"dynamics.length": 0.0}, r"length: expected a number > 0, got 0\.0"),
+    (SDSEF, {"dynamics.duration": -1.0}, r"duration: expected a number > 0, got -1\.0"),
+    (SDSEF, {"dynamics.log_speed_range": [1.0, -1.0]}, "log_speed_range: expected its lower end first"),
+    (ChebyshevDS, {"dynamics.law.omega": 0.0}, r"omega: expected a number > 0, got 0\.0"),
+    *[
+        (TubeDS, {f"dynamics.{law}.knots": knots, f"dynamics.{law}.speeds": speeds}, message)
+        for law in ("law", "transverse_law")
+        for knots, speeds, message in [
+            ([0.5, 0.1], [1.0, 1.0], r"knots: expected \(m,\) finite numbers increasing from above 0"),
+            ([0.0, 0.1], [1.0, 1.0], r"knots: expected \(m,\) finite numbers increasing from above 0"),
+            ([[0.1, 0.5]], [[1.0, 1.0]], r"knots: expected \(m,\) finite numbers increasing from above 0"),
+            (0.1, 1.0, r"knots: expected \(m,\) finite numbers increasing from above 0"),
+            ([], [], r"knots: expected \(m,\) finite numbers increasing from above 0"),
+            ([0.1, 0.5], [1.0, 0.0], r"speeds: expected \(2,\) finite numbers > 0"),
+            ([0.1, 0.5], [1.0, -1.0], r"speeds: expected \(2,\) finite numbers > 0"),
+            ([0.1, 0.5], [1.0], r"speeds: expected \(2,\) finite numbers > 0"),
+        ]
+    ],
+]
+
+
+@pytest.mark.parametrize(("kind", "tensors", "message"), NO_SYSTEM)
+def test_numbers_that_make_no_system_are_refused(tmp_path, kind, tensors, message):
+    changed(tmp_path / "a", kind(2, n_layers=3), **tensors)
+    with pytest.raises(ValueError, match=f"path: a does not hold a system that can be loaded: .*{message}"):
+        latentds.load(tmp_path / "a", classes=[FDM, SDSEF])
+
+
+@pytest.mark.parametrize("dtypes", [(torch.float32,), (torch.float32, torch.float64)])
+def test_rounding_makes_no_system_unloadable(tmp_path, dtypes):
+    ds = TubeDS(3, n_layers=5, refined=False).fit(wavy_motion(3))
+    for dtype in dtypes:
+        ds.to(dtype)
     ds.save(tmp_path / "a")
-    state = load_file(tmp_path / "a")
-    state["dynamics.law.knots"] = torch.tensor([0.5, 0.1])
-    state["dynamics.law.speeds"] = torch.tensor([1.0, 1.0])
-    told = {"format": FORMAT, "class": "TubeDS", "settings": ds.settings, "report": None}
-    save_file(state, tmp_path / "a", metadata={"latentds": json.dumps(told)})
-    with pytest.raises(ValueError, match="knots: expected"):
-        latentds.load(tmp_path / "a")
+    assert torch.equal(latentds.load(tmp_path / "a").dynamics.axis, ds.dynamics.axis)
 
 
 def test_every_truncation_is_a_clear_error(tmp_path):
