@@ -21,6 +21,7 @@ from .deploy.tables import FieldTables, field_tables
 from .diffeomorphism import Diffeomorphism
 from .dynamics import LatentDynamics
 from .files import write_tensors
+from .integrate import integrate
 
 FORMAT = 2
 """Of the files of systems; raised when they change so that another latentds would misread them."""
@@ -53,8 +54,8 @@ class FitReport:
 class StableDS(nn.Module, ABC):
     """A velocity field ẏ = f(y) on R^n, globally asymptotically stable at ``attractor``.
 
-    A new method subclasses this, implements :meth:`fit`, :meth:`forward`, :meth:`lyapunov` and :meth:`rollout`,
-    and certifies itself with :func:`latentds.testing.check_stable_ds`. An unfitted system is stable too.
+    A new method subclasses this, implements :meth:`fit`, :meth:`forward` and :meth:`lyapunov`, and certifies itself
+    with :func:`latentds.testing.check_stable_ds`. An unfitted system is stable too.
 
     Everything is computed in the module's dtype (float64 unless moved with ``.to``) and returned in the dtype of
     the input. Arrays are accepted where tensors are.
@@ -86,12 +87,17 @@ class StableDS(nn.Module, ABC):
     def lyapunov(self, y: Tensor) -> Tensor:
         """V(y) >= 0, zero only at the attractor, decreasing along every motion: (..., n) -> (...)."""
 
-    @abstractmethod
     def rollout(self, y0: Tensor, t: Tensor) -> Tensor:
         """The motion from ``y0`` at times ``t``: (..., n), (T,) seconds, not decreasing -> (..., T, n).
 
         The state at ``t[0]`` is ``y0``: ``out[..., 0, :] == y0``.
+
+        Unless a method knows its flow in closed form and overrides this, as :class:`LatentDS` does, :meth:`forward` is
+        integrated: see :func:`latentds.integrate.integrate` for the tolerance, and for the RuntimeWarning of a motion
+        that cannot go on and is NaN from there.
         """
+        points, wanted = self._points(y0, "y0")
+        return self._begun_at(y0, integrate(self.forward, points, self._times(t), self.attractor).to(wanted))
 
     def controller(self) -> Controller:
         """The velocity field as it is now for a real-time loop, NumPy in and out: see :class:`Controller`."""
@@ -152,6 +158,12 @@ class StableDS(nn.Module, ABC):
             raise ValueError("t: expected times that do not decrease, got a step back")
         return (times - times[0]).to(self.attractor.dtype)
 
+    @staticmethod
+    def _begun_at(y0: Any, path: Tensor) -> Tensor:
+        """``path`` (..., T, n) with ``y0`` itself, not what rounding made of it, as its first point."""
+        start = torch.as_tensor(y0).to(path.dtype)
+        return torch.cat([start.unsqueeze(-2), path[..., 1:, :]], dim=-2)
+
 
 class LatentDS(StableDS):
     """A stable system made of a diffeomorphism ψ (latent -> demonstration) and latent dynamics.
@@ -209,6 +221,4 @@ class LatentDS(StableDS):
         points, wanted = self._points(y0, "y0")
         times = self._times(t)
         latent = self.dynamics.flow(self.diffeomorphism.inverse(points), times)
-        path = self.diffeomorphism(latent).to(wanted)
-        start = torch.as_tensor(y0).to(wanted)
-        return torch.cat([start.unsqueeze(-2), path[..., 1:, :]], dim=-2)
+        return self._begun_at(y0, self.diffeomorphism(latent).to(wanted))
