@@ -285,7 +285,7 @@ def _refuse_crossings(path: Array, origin: Array, unit: float) -> None:
     near = np.linalg.norm(gap + s[:, None] * step[first] - t[:, None] * step[second], axis=1)
     worst = int(np.argmin(near))
     if near[worst] < 1e-7 * np.ptp(path, axis=0).max():
-        where = np.array2string(origin + unit * start[first[worst]], precision=4)
+        where = f"[{', '.join(f'{value:.4g}' for value in origin + unit * start[first[worst]])}]"
         raise ValueError(
             f"demonstration: expected a path that does not meet itself, got one that comes back to {where} "
             f"({first[worst] / count:.0%} and {(second[worst] + 1) / count:.0%} of the way); "

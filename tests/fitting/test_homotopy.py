@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from latentds.fitting import homotopy
 from latentds.fitting.homotopy import curvature_homotopy, linear_homotopy
 from latentds.testing import wavy_motion
 
@@ -84,6 +85,21 @@ def test_each_curve_lies_rigidly_nearest_to_the_next(curve):
             middle = one.mean(0)
             moved = (one - middle) @ turn + middle + 1e-3 * rng.standard_normal(dim)
             assert ((moved - after) ** 2).sum() >= best - 1e-12
+
+
+def test_a_curve_is_laid_on_its_mirror_image_without_being_mirrored():
+    t = np.linspace(0, 4, 50)[:, None]
+    helix = np.hstack([np.cos(t), np.sin(t), 0.3 * t])
+    laid = homotopy._laid_on(helix, helix * [1, 1, -1])
+
+    def handedness(curve):
+        first, second, third = (np.diff(curve, k, axis=0)[:47] for k in (1, 2, 3))
+        return np.sign(np.einsum("ij,ij->i", np.cross(first, second), third))
+
+    np.testing.assert_array_equal(handedness(laid), handedness(helix))
+    np.testing.assert_allclose(
+        np.linalg.norm(np.diff(laid, axis=0), axis=1), np.linalg.norm(np.diff(helix, axis=0), axis=1)
+    )
 
 
 def test_unbending_moves_with_the_curve():

@@ -228,6 +228,19 @@ def test_a_path_that_passes_itself_at_a_distance_is_learned():
     assert dtw(rolled(ds, shown), shown.positions) / len(shown) < 0.003 * shown.size
 
 
+@pytest.mark.parametrize(("gap", "meets"), [(1e-9, True), (1e-4, False)])
+def test_strands_meet_when_nearer_than_a_robot_could_tell(gap, meets):
+    """An eight in space whose strands pass each other at a distance, told in the demonstration's own coordinates."""
+    t = np.linspace(-0.5, 2 * np.pi - 1.2, 400)
+    eight = np.stack([np.sin(t), np.sin(2 * t) / 2, gap * (t - np.pi) / np.pi], 1)
+    shown = Demonstration(1000 * eight + np.array([7000.0, 0, 0]), 0.01)
+    if meets:
+        with pytest.raises(ValueError, match=r"comes back to \[69\d\d, -?\d"):
+            fast(3).fit(shown)
+    else:
+        assert fast(3).fit(shown).fit_report is not None
+
+
 def test_noise_is_no_crossing():
     shown = motion(pause)
     noise = 3e-4 * tensor(np.random.default_rng(0).standard_normal((400, 2)))
@@ -255,6 +268,17 @@ def test_far_starts_and_starts_behind_the_goal_arrive_without_wild_speeds(dim, d
     pull = 0.25 * ds.contraction * shown.size / shown.duration  # as fast as it may come in from the side
     most = shown.velocities.norm(dim=-1).max() + pull
     assert speeds.max() < 3 * ds.fit_report.condition_tube * most
+
+
+def test_far_from_the_axis_the_pull_stops_growing():
+    """An unfitted map is the identity: what is left of the velocity across the path is the pull alone."""
+    shown = Demonstration(torch.stack([torch.linspace(2, 0, 200), torch.zeros(200)], 1), 0.01)
+    ds = TubeDS(2, contraction=10.0, refined=False).fit(shown)
+    aside = tensor([0.1, 0.5, 5.0])[:, None] * shown.size * tensor([0.0, 1.0])
+    with torch.no_grad():
+        inward = -ds(shown.start / 2 + aside)[:, 1]
+    wanted = tensor([0.1, 0.25, 0.25]) * shown.size * 10 / shown.duration
+    torch.testing.assert_close(inward, wanted, rtol=1e-6, atol=0)
 
 
 @pytest.mark.parametrize("kappa", [5.0, 20.0, 80.0])
@@ -368,6 +392,17 @@ def test_report_agrees_with_autograd():
     assert report.largest_gradient >= 0.9 * slopes
     assert report.isotopy in ("straight", "unbending")
     assert 0 <= report.rollout_error < 0.01
+
+
+@pytest.mark.parametrize("n_layers", [3, 60])
+def test_rollout_error_is_the_distance_of_the_rollout(n_layers):
+    """At a constant speed equal progress is equal time."""
+    angle = torch.linspace(0, 3, 600, dtype=torch.float64)
+    shown = Demonstration(torch.stack([angle.cos(), angle.sin()], 1), 0.01)
+    ds = fast(2, n_layers=n_layers).fit(shown)
+    distance = (rolled(ds, shown) - shown.positions).norm(dim=-1).mean() / shown.size
+    assert ds.fit_report.rollout_error == pytest.approx(float(distance), rel=0.05, abs=1e-5)
+    assert ds.fit_report.rollout_error > 1e-7
 
 
 def test_refinement_pays():
