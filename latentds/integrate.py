@@ -42,7 +42,7 @@ def integrate(
         y0: (..., n), floating.
         times: (T,) seconds since the start, the first 0, not decreasing.
         attractor: (n,), where the velocity is 0.
-        max_steps: tried for each row, >= 1.
+        max_steps: tried for each row, >= 1; none is longer than about three of the field's shortest time constants.
 
     Returns:
         (..., T, n). A row that cannot go on is NaN from there on, and a RuntimeWarning says so: its velocity is not
@@ -73,8 +73,9 @@ def integrate(
         failed = ~done & (~(t + h > t) | ~distance.isfinite() | (step == max_steps))
         stays = ~(done | failed)
         if not stays.all():
+            reason = f"{max_steps} steps were not enough" if step == max_steps else "no step was short enough"
             for i in (failed & size.isfinite()).nonzero()[:, 0].tolist():
-                lost.append(f"row {int(rows[i])} at {float(t[i]):.6g} s, y = {y[i].tolist()}")
+                lost.append(f"row {int(rows[i])} at {float(t[i]):.6g} s, y = {y[i].tolist()}: {reason}")
             row, time = _due(answered, torch.where(stays, answered, len(clock)))
             answer(row, time, torch.where(failed[row, None], torch.nan, y[row]))
             state = (rows, y, slope, t, h, error_before, size, answered, distance, tolerance)
@@ -103,8 +104,8 @@ def integrate(
         error_before = torch.where(accepted, error.clamp(min=1e-4), error_before)
     if lost:
         warnings.warn(
-            f"{len(lost)} of {y0[..., 0].numel()} motions are NaN from where they could not go on: the velocity is not "
-            f"finite or jumps there, or {max_steps} steps were not enough (a stiff field); {lost[0]}",
+            f"{len(lost)} of {y0[..., 0].numel()} motions could not go on and are NaN from there, as in a field "
+            f"that is stiff, that jumps or that is not finite everywhere; the first is {lost[0]}",
             RuntimeWarning,
             stacklevel=3,
         )

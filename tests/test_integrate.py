@@ -153,7 +153,7 @@ def test_a_row_that_is_not_finite_stops_no_other(wall, starts):
 
     starts = starts.clamp(-1, 0.2)
     starts[2], starts[3], starts[4] = 1.0, 2e3, wall
-    with pytest.warns(RuntimeWarning, match=r"2 of 6 motions are NaN .* not finite .*row 3 at 0 s"):
+    with pytest.warns(RuntimeWarning, match=r"2 of 6 motions .* row 3 at 0 s, .* no step was short enough"):
         paths = integrate(velocity, starts, TIMES, ORIGIN)
     others = [0, 1, 5]
     assert torch.equal(paths[others], integrate(velocity, starts[others], TIMES, ORIGIN))
@@ -170,7 +170,7 @@ def test_what_is_too_stiff_or_jumps_is_told(starts):
         "slides along a jump": lambda y: torch.stack([-y[:, 0].sign(), -y[:, 1]], dim=-1),
     }
     for name, velocity in jumps.items():
-        with pytest.warns(RuntimeWarning, match="6 of 6 motions are NaN .* 300 steps"):
+        with pytest.warns(RuntimeWarning, match="6 of 6 motions .* 300 steps were not enough"):
             paths = integrate(velocity, starts, TIMES, ORIGIN, max_steps=300)
         assert paths[:, -1].isnan().all(), name
 
