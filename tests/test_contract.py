@@ -10,7 +10,7 @@ import torch
 import baselines.sdsef
 from baselines import FDM, SDSEF
 from latentds import ChebyshevDS, Demonstration, TubeDS
-from latentds.testing import check_stable_ds, wavy_motion
+from latentds.testing import parametrize_stable_ds, wavy_motion
 
 METHODS = {
     "ChebyshevDS": lambda dim: ChebyshevDS(dim, n_layers=30),
@@ -26,11 +26,9 @@ def _short_training(monkeypatch):
     monkeypatch.setitem(baselines.sdsef.PLANS, "tuned", replace(plan, epochs=25))
 
 
-@pytest.mark.parametrize("fitted", [False, True], ids=["unfitted", "fitted"])
-@pytest.mark.parametrize("dim", [1, 2, 3, 7])
-@pytest.mark.parametrize("method", METHODS)
-def test_contract(method, dim, fitted):
-    check_stable_ds(METHODS[method], dims=[dim], fitted=[fitted])
+@parametrize_stable_ds(METHODS, dims=[1, 2, 3, 7])
+def test_contract(check):
+    check()
 
 
 @pytest.mark.parametrize("method", METHODS)
