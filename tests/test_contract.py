@@ -13,17 +13,17 @@ from latentds import ChebyshevDS, Demonstration, TubeDS
 from latentds.testing import parametrize_stable_ds, wavy_motion
 
 METHODS = {
-    "ChebyshevDS": lambda dim: ChebyshevDS(dim, n_layers=30),
-    "FDM": lambda dim: FDM(dim, n_layers=30),
-    "SDSEF": lambda dim: SDSEF(dim, n_layers=4, n_features=20, seed=0),
-    "TubeDS": lambda dim: TubeDS(dim, n_layers=20, refined=False),
+    "ChebyshevDS": lambda dim: ChebyshevDS(dim, n_layers=15),
+    "FDM": lambda dim: FDM(dim, n_layers=15),
+    "SDSEF": lambda dim: SDSEF(dim, n_layers=3, n_features=20, seed=0),
+    "TubeDS": lambda dim: TubeDS(dim, n_layers=15, refined=False),
 }
 
 
 @pytest.fixture(autouse=True)
 def _short_training(monkeypatch):
     plan = baselines.sdsef.PLANS["tuned"]
-    monkeypatch.setitem(baselines.sdsef.PLANS, "tuned", replace(plan, epochs=25))
+    monkeypatch.setitem(baselines.sdsef.PLANS, "tuned", replace(plan, epochs=10))
 
 
 @parametrize_stable_ds(METHODS, dims=[1, 2, 3, 7])

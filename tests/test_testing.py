@@ -427,7 +427,7 @@ BROKEN = {
     Folds: "check_inverse: decode",
     HasAWrongJacobian: "check_jacobian: jacobian",
     DetachesGradients: "check_gradients: no gradient leaves velocity",
-    DetachesAParameter: "check_gradients: no gradient reaches rate",
+    DetachesAParameter: "check_gradients: no gradient of velocity or V reaches rate",
     AnswersInFloat64: "check_dtypes: float32 input is torch.float64",
     KeepsAFloat64Tensor: "check_dtypes: float32 input is torch.float64",
     AnswersInTheTimesDtype: "check_dtypes: rollout of torch.float32 input is torch.float64",
