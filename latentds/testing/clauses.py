@@ -149,7 +149,7 @@ def check_gradients(case: Case) -> None:
         y = (case.few if what == "rollout" else case.probes).clone().requires_grad_()
         answer = case.calls(ds)[what](y)
         expect(answer.requires_grad, f"no gradient leaves {what}")
-        answer.square().sum().backward()
+        torch.autograd.backward(answer.square().sum())
         expect(y.grad is not None, f"no gradient of {what} reaches its input")
         for name, leaf in {"its input": y, **learned}.items():
             finite = leaf.grad is None or bool(torch.isfinite(leaf.grad).all())
