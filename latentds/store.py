@@ -132,8 +132,8 @@ def fingerprint(*things: Any) -> str:
     return reading.digest.hexdigest()
 
 
-_DRAWING = {"plotting.py", "testing.py"}
-"""Files of this library that change no number."""
+_DRAWING = {"plotting.py", "testing"}
+"""Files and folders of this library that change no number."""
 _CODE = (
     "co_code", "co_consts", "co_names", "co_varnames", "co_freevars", "co_cellvars", "co_flags", "co_argcount",
     "co_posonlyargcount", "co_kwonlyargcount", "co_exceptiontable",
@@ -150,7 +150,7 @@ def _package(folder: str) -> bytes:
     """The Python files of a package and its subpackages."""
     digest, ours = hashlib.sha256(), Path(folder) == Path(__file__).parent
     for path in sorted(Path(folder).rglob("*.py")):
-        if not (ours and path.name in _DRAWING):
+        if not (ours and path.relative_to(folder).parts[0] in _DRAWING):
             digest.update(str(path.relative_to(folder)).encode() + path.read_bytes())
     return digest.digest()
 
