@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 Factory = Callable[[int], StableDS]
 
-SETTLING = 20.0
+HORIZON = 20.0
 """Demonstration durations after which ``converged`` looks where a motion is."""
-ARRIVED = 1e-2
+CONVERGED = 1e-2
 """``converged``: largest distance from the attractor by then, as a share of the motion's size."""
 ON_GOAL = 1e-6
 """``converged``: largest distance of the attractor from the demonstrated goal, as a share of the motion's size."""
@@ -145,7 +145,7 @@ def compare(
           their scores are NaN.
         * ``dtw``, ``dtw_fast``: exact and FastDTW (radius 1) distance to the demonstration, raw sums; ``…_per_point``
           divided by ``n_points``. ``frechet``, ``endpoint_error``, ``path_length_ratio``: see :mod:`latentds.metrics`.
-        * ``converged``: after ``SETTLING`` durations the motion is within ``ARRIVED`` of the demonstration's size from
+        * ``converged``: after ``HORIZON`` durations the motion is within ``CONVERGED`` of the demonstration's size from
           the attractor, and that lies within ``ON_GOAL`` of it from the demonstrated goal.
         * ``velocity_rmse``, ``velocity_cosine``: the learned field against the demonstrated velocities at the
           demonstrated points; ``mse``: the fit's own. These and all below are one number per cell.
@@ -241,7 +241,7 @@ def _name(cell: Cell) -> tuple[str, str, int]:
 def _key(cell: Cell, protocol: Protocol) -> str | None:
     """What a finished cell is known by; None for a method that cannot even be made."""
     try:
-        with _alone(cell.seed):
+        with isolated_rng(cell.seed):
             ds = _build(cell)
     except Exception:
         return None
@@ -258,7 +258,7 @@ def evaluate(cell: Cell, protocol: Protocol) -> Outcome:
     facts: dict[str, Any] = dict.fromkeys(SCORES, math.nan)
     error = ""
     try:
-        with _alone(cell.seed):
+        with isolated_rng(cell.seed):
             ds = _build(cell)
             kernels.warmup([shown.dim])  # compiling is nobody's fitting time
             began = time.perf_counter()
@@ -320,10 +320,10 @@ def _scores(path: NDArray[np.float64], reference: NDArray[np.float64]) -> dict[s
 
 
 def _converged(ds: StableDS, shown: Demonstration, starts: Tensor) -> NDArray[np.bool_]:
-    later = torch.tensor([0.0, SETTLING * shown.duration], dtype=torch.float64)
+    later = torch.tensor([0.0, HORIZON * shown.duration], dtype=torch.float64)
     left = torch.linalg.vector_norm(ds.rollout(starts, later)[:, -1] - ds.attractor, dim=-1)
     missed = torch.linalg.vector_norm(ds.attractor - shown.goal)
-    arrived = (left <= ARRIVED * shown.size) & (missed <= ON_GOAL * shown.size)
+    arrived = (left <= CONVERGED * shown.size) & (missed <= ON_GOAL * shown.size)
     return np.asarray(arrived.numpy())
 
 
@@ -335,7 +335,7 @@ _TURN = threading.RLock()
 
 
 @contextmanager
-def _alone(seed: int) -> Iterator[None]:
+def isolated_rng(seed: int) -> Iterator[None]:
     """Torch's generator seeded and one thread, for this block; both are the process's, so blocks take turns."""
     with _TURN, torch.random.fork_rng():
         threads = torch.get_num_threads()
