@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent.parent
 ROOMS = (
     "arguments", "files", "demonstration", "recordings", "datasets", "time_law", "kernels", "diffeomorphism",
     "dynamics", "deploy", "integrate", "metrics", "base", "wrappers", "fitting", "methods", "storage", "store",
-    "certificate", "testing", "benchmark", "plotting", "report", "cli",
+    "certificate", "testing", "cell", "benchmark", "plotting", "report", "cli",
 )  # fmt: skip
 """Of latentds; each may import itself and those before it."""
 PACKAGES = ("latentds", "baselines", "experiments")
