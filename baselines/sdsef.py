@@ -55,13 +55,22 @@ class SDSEF(LatentDS):
         n_features: F >= 1, random Fourier features in each half of a coupling.
         recipe: "tuned" or "official".
         seed: of the frozen features, the initial network and the batches; None draws them from torch's generator.
+        epochs: most passes over the samples, >= 1, in place of the recipe's own 5000 (official) or 710 (tuned); None
+            keeps those. The tuned recipe learns in stages, each of which gets one epoch at least.
     """
 
     diffeomorphism: AffineCouplings
     dynamics: NormalizedDescent
 
     def __init__(
-        self, dim: int, *, n_layers: int = 10, n_features: int = 200, recipe: str = "tuned", seed: int | None = None
+        self,
+        dim: int,
+        *,
+        n_layers: int = 10,
+        n_features: int = 200,
+        recipe: str = "tuned",
+        seed: int | None = None,
+        epochs: int | None = None,
     ) -> None:
         if recipe not in list(PLANS):
             raise ValueError(f"recipe: expected one of {sorted(PLANS)}, got {recipe!r}")
@@ -72,6 +81,7 @@ class SDSEF(LatentDS):
         self.n_layers, self.n_features = psi.n_layers, psi.n_features
         self.recipe = recipe
         self.seed = self_seed
+        self.epochs = None if epochs is None else whole_number(epochs, "epochs", at_least=1)
 
     def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> SDSEF:
         shown = demonstrations_of(demonstration, self.dim)
@@ -83,8 +93,10 @@ class SDSEF(LatentDS):
             self.dim, n_layers=psi.n_layers, n_features=psi.n_features, recipe=self.recipe, seed=self.seed
         ).to(self.attractor.device, torch.float32)
         data = _Normalized.of(shown)
+        plan = PLANS[self.recipe]
+        plan = plan if self.epochs is None else replace(plan, epochs=self.epochs)
         train = _train_tuned if self.recipe == "tuned" else _train_official
-        training = train(learner, data, _generator(self.seed), progress)
+        training = train(learner, data, plan, _generator(self.seed), progress)
         self.load_state_dict(learner.state_dict())
         self._place(data, shown)
         with torch.no_grad():
@@ -273,7 +285,9 @@ class _Normalized(NamedTuple):
         )
 
 
-def _train_official(learner: SDSEF, data: _Normalized, generator: torch.Generator | None, progress: bool) -> Training:
+def _train_official(
+    learner: SDSEF, data: _Normalized, plan: Plan, generator: torch.Generator | None, progress: bool
+) -> Training:
     points, velocities, goal = (part.to(learner.attractor) for part in (data.points, data.velocities, data.goal))
     linearize, network = _linearize(learner), learner.dynamics.network
 
@@ -283,17 +297,16 @@ def _train_official(learner: SDSEF, data: _Normalized, generator: torch.Generato
         predicted = -network(u).exp() * push(_unit(x - x[-1]))[:-1]
         return nn.functional.smooth_l1_loss(predicted, velocities[batch])
 
-    return descend(
-        loss, list(learner.parameters()), len(points), PLANS["official"], generator=generator, progress=progress
-    )
+    return descend(loss, list(learner.parameters()), len(points), plan, generator=generator, progress=progress)
 
 
-def _train_tuned(learner: SDSEF, data: _Normalized, generator: torch.Generator | None, progress: bool) -> Training:
+def _train_tuned(
+    learner: SDSEF, data: _Normalized, plan: Plan, generator: torch.Generator | None, progress: bool
+) -> Training:
     """Continuation: a chord lies on one latent ray to begin with, and a curve that bends slowly is held there.
 
     In the plane a curve may cross itself while it bends, so there the demonstration is learned at once.
     """
-    plan = PLANS["tuned"]
     stages = STAGES if learner.dim > 2 else 1
     short = plan.epochs // 19
     history: list[float] = []

@@ -1,211 +1,75 @@
-"""The paper's figures that :mod:`latentds.plotting` does not draw."""
+"""Pictures of the ablation and of the speed measurements."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
-import torch
-from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from experiments.tuning import Tried
-from latentds import ChebyshevDS, Demonstration
-from latentds.base import StableDS
-from latentds.fitting.embedding import chebyshev_columns, map_to_endpoints
-from latentds.plotting import SHOWN, color_of
+from latentds import Demonstration, plotting
 
 Array = NDArray[np.float64]
 
-DPI = 100
-GOAL = {"marker": "*", "color": "#E69F00", "mec": SHOWN, "mew": 0.6, "ms": 12, "ls": ""}
 
-
-def framework(shown: Demonstration, ds: ChebyshevDS, n_nodes: int = 12) -> Figure:
-    """From a 3-D demonstration by K = 4 copies, their graph and the latent points to the mapped points."""
-    points = shown.positions.numpy()
-    columns = chebyshev_columns(len(shown), 3)[::-1]
-    latent = map_to_endpoints(columns, points[0], points[-1])
-    with torch.no_grad():
-        mapped = ds.decode(torch.from_numpy(latent)).numpy()
-    figure = Figure(figsize=(13, 8), dpi=DPI, layout="constrained")
-    solid = {"projection": "3d"}
-    axes = figure.add_subplot(2, 3, 1, **solid)
-    axes.plot(*points.T, color=SHOWN, lw=1)
-    axes.plot(*points[-1:].T, **GOAL)
-    axes.set_title(f"(a) demonstration, {shown.name}")
-    axes = figure.add_subplot(2, 3, 2, **solid)
-    for copy in range(4):
-        axes.plot(*(points + np.array([0, 0, 2.4 * copy])).T, lw=0.8, color=f"C{copy}", label=f"copy {copy + 1}")
-    axes.set_title("(b) K = 4 copies (drawn apart)")
-    axes.legend(fontsize=8, loc="upper left", frameon=False, ncols=2)
-    axes = figure.add_subplot(2, 3, 3)
-    _graph(axes, 4, n_nodes)
-    axes.set_title(f"(c) their graph ({n_nodes} of {len(shown)} nodes a path)")
-    for place_, title, cloud in (
-        (4, "(d) latent points: eigenvector entries", columns),
-        (5, "(e) laid from start to goal", latent),
-        (6, f"(f) mapped by ψ, MSE {np.square(mapped - points).mean():.1e}", mapped),
-    ):
-        axes = figure.add_subplot(2, 3, place_, **solid)
-        some = cloud[:: max(1, len(cloud) // 120)] if place_ < 6 else cloud
-        axes.plot(*some.T, ".", ms=4 if place_ < 6 else 2, color=color_of("Chebyshev"))
-        if place_ > 4:
-            axes.plot(*points.T, color=SHOWN, lw=0.6, ls="--", alpha=0.6)
-        axes.plot(*cloud[-1:].T, **GOAL)
-        axes.set_title(title)
-    for axes in figure.axes:
-        axes.tick_params(labelsize=7)
-        if hasattr(axes, "zaxis"):
-            axes.view_init(elev=20, azim=-60)
+def gains(rows: pd.DataFrame, families: Sequence[str]) -> Figure:
+    """Mean score of every method on every family, from the demonstrated start and from the others."""
+    families = [family for family in families if (rows["family"] == family).any()]
+    labels = list(rows[rows["family"].isin(families)]["method"].unique())
+    figure = Figure(figsize=(3.2 * len(families) + 2, 5.2), dpi=plotting.DPI, layout="constrained")
+    panels = figure.subplots(1, len(families), sharey=True, squeeze=False)[0]
+    place = -np.arange(len(labels))
+    for axes, family in zip(panels, families, strict=True):
+        found = rows[rows["family"] == family]
+        for part, colour, shift, name in (
+            (found[found["start"] > 0], plotting.COLORS["Chebyshev"], 0.19, "other starts"),
+            (found[found["start"] == 0], plotting.COLORS["FDM"], -0.19, "demonstrated start"),
+        ):
+            means = part.groupby("method")["share"].mean().reindex(labels)
+            axes.barh(place + shift, means, 0.36, color=colour, label=name)
+        axes.set(xscale="log", xlim=(5e-5, 1), title=family, xlabel="DTW/500 [sizes of the motion]")
+        axes.set_yticks(place, labels)
+        axes.grid(axis="x", color="#DDDDDD", lw=0.6)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
     return figure
 
 
-def _graph(axes, copies: int, n_nodes: int) -> None:
-    angles = np.pi / 4 + 2 * np.pi * np.arange(copies) / copies
-    ends = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    ring = np.concatenate([ends, ends[:1]])
-    axes.plot(*ring.T, color=SHOWN, lw=1.2, zorder=1)
-    for copy, end in enumerate(ends):
-        path = end * np.linspace(3, 1, n_nodes)[:, None]
-        axes.plot(*path.T, "-o", color=f"C{copy}", ms=5, lw=1.2)
-        axes.annotate(f"$\\nu_1^{copy + 1}$", path[0], xytext=14 * end - 6, textcoords="offset points", fontsize=11)
-    axes.plot(*ends.T, **GOAL)
-    axes.text(0, 0, "cycle of the\nlast nodes", ha="center", va="center", fontsize=9)
-    axes.set_aspect("equal")
-    axes.axis("off")
-
-
-def heat_map(tried: Sequence[Tried], n_layers: int, title: str) -> Figure:
-    """MSE over (μ, β) at one M."""
-    found = {(one.mu, one.beta): one.mse for one in tried if one.n_layers == n_layers}
-    mus, betas = (sorted({key[i] for key in found}) for i in (0, 1))
-    table = np.array([[found[mu, beta] for mu in mus] for beta in betas])
-    figure = Figure(figsize=(2.4 + 0.72 * len(mus), 1.8 + 0.42 * len(betas)), dpi=DPI, layout="constrained")
-    axes = figure.add_subplot()
-    norm = LogNorm(table.min(), table.max())
-    image = axes.imshow(table, origin="lower", aspect="auto", cmap="viridis", norm=norm)
-    for (row, column), value in np.ndenumerate(table):
-        shade = "white" if norm(value) < 0.6 else "black"
-        axes.text(column, row, f"{value:.0e}", ha="center", va="center", fontsize=8, color=shade)
-    axes.set_xticks(range(len(mus)), [f"{mu:g}" for mu in mus])
-    axes.set_yticks(range(len(betas)), [f"{beta:g}" for beta in betas])
-    axes.set(xlabel="μ", ylabel="β", title=title)
-    figure.colorbar(image, label="MSE per coordinate")
+def handwriting(shapes: Mapping[str, tuple[Sequence[Demonstration], Array]]) -> Figure:
+    """Every shape: what was shown, the rollout from its start, and those from the other demonstrations' starts."""
+    columns = 6 if len(shapes) > 4 else len(shapes)
+    height = math.ceil(len(shapes) / columns)
+    figure = Figure(figsize=(2.1 * columns, 2.2 * height + 0.4), dpi=plotting.DPI, layout="constrained")
+    panels = figure.subplots(height, columns, squeeze=False).ravel()
+    for axes in panels[len(shapes) :]:
+        axes.set_axis_off()
+    for axes, (name, (written, paths)) in zip(panels, shapes.items(), strict=False):
+        for i, path in enumerate(paths[1:]):
+            axes.plot(*path.T, color="#56B4E9", lw=0.8, label="" if i else "from the other six starts")
+            axes.plot(*path[0], ".", color="#0072B2", ms=4)
+        axes.plot(*paths[0].T, color=plotting.COLORS["TubeDS"], lw=2.2, label="from the demonstrated start")
+        axes.plot(*written[0].positions.T, "--", color=plotting.SHOWN, lw=0.9, label="demonstration")
+        axes.plot(*written[0].goal, "*", color="#E69F00", mec=plotting.SHOWN, mew=0.5, ms=9)
+        axes.set_title(name, fontsize=9)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set(xticks=[], yticks=[])
+        axes.spines[:].set_color("#CCCCCC")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 
-def normalised_bars(scores: Mapping[str, Mapping[str, Array]], title: str) -> Figure:
-    """Mean and standard deviation over the starts, every spiral's scores divided by the largest of its means.
-
-    Args:
-        scores: {spiral: {method: scores of the starts}}.
-    """
-    methods = list(dict.fromkeys(method for found in scores.values() for method in found))
-    figure = Figure(figsize=(2.5 + 1.0 * len(scores), 4.2), dpi=DPI, layout="constrained")
-    axes = figure.add_subplot()
-    width = 0.82 / len(methods)
-    for i, method in enumerate(methods):
-        for k, found in enumerate(scores.values()):
-            worst = max((np.mean(s) for s in found.values() if np.isfinite(s).all()), default=np.nan)
-            values = found.get(method, np.array([np.nan])) / worst
-            spread = values.std(ddof=1) if len(values) > 1 else 0.0
-            mean = values.mean()
-            axes.bar(
-                k + (i - (len(methods) - 1) / 2) * width,
-                mean,
-                0.92 * width,
-                yerr=[[min(spread, mean)], [spread]] if np.isfinite(mean) else None,
-                color=color_of(method),
-                ecolor=SHOWN,
-                capsize=2.5,
-                label="" if k else method,
-            )
-            if not np.isfinite(mean):
-                axes.text(k + (i - (len(methods) - 1) / 2) * width, 0.01, "×", ha="center", color=color_of(method))
-    axes.set_xticks(range(len(scores)), list(scores), rotation=20, ha="right")
-    axes.set(ylabel="FastDTW, normalised per spiral", title=title)
-    axes.grid(axis="y", color="#DDDDDD", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside lower center", ncols=len(methods), fontsize=9, frameon=False)
-    return figure
-
-
-def p_values(tests: pd.DataFrame) -> Figure:
-    """Columns spiral, p (Welch, FastDTW) and lower, the method with the lower mean; log scale."""
-    figure = Figure(figsize=(2.5 + 0.8 * len(tests), 3.6), dpi=DPI, layout="constrained")
-    axes = figure.add_subplot()
-    floor = 1e-16
-    for i, (_, row) in enumerate(tests.iterrows()):
-        axes.bar(i, max(row["p"], floor), 0.6, color=color_of(row["lower"]))
-    axes.set_yscale("log")
-    axes.axhline(0.05, color=SHOWN, ls="--", lw=1)
-    axes.text(len(tests) - 0.5, 0.05, "p = .05", va="bottom", ha="right", fontsize=8)
-    for method in dict.fromkeys(tests["lower"]):
-        axes.bar(np.nan, np.nan, color=color_of(method), label=f"{method} nearer")
-    axes.set_xticks(range(len(tests)), list(tests["spiral"]), rotation=20, ha="right")
-    axes.set(ylabel="p of Welch's t-test", title="Chebyshev against FDM, 20 starts, FastDTW")
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside lower center", ncols=2, fontsize=9, frameon=False)
-    return figure
-
-
-def planes(motions: Sequence[Demonstration], fitted: Mapping[str, Mapping[str, StableDS]], starts: int = 8) -> Figure:
-    """A row per planar motion: rollouts and streamlines of each method side by side.
-
-    Args:
-        fitted: {motion: {method: system}}.
-    """
-    methods = list(fitted[motions[0].name])
-    shape = len(motions), 2 * len(methods)
-    figure = Figure(figsize=(3.4 * shape[1], 3.3 * shape[0]), dpi=DPI, layout="constrained")
-    grid = figure.subplots(*shape, squeeze=False)
-    for row, shown in zip(grid, motions, strict=True):
-        points = shown.positions.numpy()
-        border = 0.3 * shown.size
-        low, high = points.min(axis=0) - border, points.max(axis=0) + border
-        x, y = (np.linspace(a, b, 50) for a, b in zip(low, high, strict=True))
-        turns = 2 * np.pi * np.arange(starts) / starts
-        around = 0.05 * shown.size * np.stack([np.cos(turns), np.sin(turns)], axis=1)
-        begins = shown.start + torch.from_numpy(np.concatenate([np.zeros((1, 2)), around]))
-        for k, method in enumerate(methods):
-            ds = fitted[shown.name][method]
-            with torch.no_grad():
-                velocity = ds(torch.from_numpy(np.stack(np.meshgrid(x, y), axis=-1))).numpy()
-                paths = ds.rollout(begins, torch.linspace(0, 3 * shown.duration, 1500)).numpy()
-            moved, field = row[2 * k], row[2 * k + 1]
-            for path in paths[1:]:
-                moved.plot(*path.T, color=color_of(method), lw=0.8, alpha=0.5)
-            moved.plot(*paths[0].T, color=color_of(method), lw=2)
-            field.streamplot(x, y, velocity[..., 0], velocity[..., 1], color="#999999", linewidth=0.6, arrowsize=0.7)
-            for axes in (moved, field):
-                axes.plot(*points.T, color=SHOWN, lw=1.4, ls="--")
-                axes.plot(*points[0], "o", color=SHOWN, ms=4)
-                axes.plot(*points[-1], **GOAL)
-                axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-                axes.tick_params(labelsize=7)
-            moved.set_title(f"{shown.name}: {method}, rollouts", fontsize=10)
-            field.set_title(f"{shown.name}: {method}, field", fontsize=10)
-    return figure
-
-
-def linearity(frame: pd.DataFrame, slopes: Mapping[int, float]) -> Figure:
-    """The largest difference of two columns' entries over N, with the paper's O(1/N²) beside."""
-    figure = Figure(figsize=(6.5, 4.4), dpi=DPI, layout="constrained")
-    axes = figure.add_subplot()
-    for i, (n, k) in enumerate(slopes.items()):
-        chosen = frame[frame["n"] == n]
-        axes.loglog(chosen["N"], chosen["entry"], "-o", ms=4, color=f"C{i}", label=f"n = {n}: slope {k:.2f}")
-        if n == max(slopes):
-            first, last = chosen.iloc[0], chosen.iloc[-1]
-            claimed = first["entry"] * (first["N"] / chosen["N"]) ** 2
-            axes.loglog(chosen["N"], claimed, ":", color=SHOWN, label="O(1/N²), the paper's")
-            axes.set_xticks([first["N"], last["N"]])
-    axes.set(xlabel="N", ylabel="largest difference of two columns", title="How far the latent curve is from a line")
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.grid(color="#E4E4E4", lw=0.6)
-    axes.legend(fontsize=9)
+def growth(curves: pd.DataFrame) -> Figure:
+    """Seconds of each call over points N and layers M, on log scales; columns grows, call, size and seconds."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    for axis, (grows, label) in zip(figure.subplots(1, 2), (("N", "points N"), ("M", "layers M")), strict=True):
+        for call, curve in curves[curves["grows"] == grows].groupby("call"):
+            axis.loglog(curve["size"], curve["seconds"], "o-", label=call, markersize=3)
+        axis.set(xlabel=label, ylabel="seconds")
+        axis.xaxis.set_minor_formatter("")
+        axis.grid(alpha=0.3)
+        axis.legend(frameon=False)
     return figure

@@ -132,7 +132,7 @@ def _flawed(path: NDArray[np.float64], flaw: str, draw: np.random.Generator) -> 
     elif flaw == "near loop":
         path[-1] = path[0] + 10.0 ** draw.uniform(-15, -3) * draw.normal(size=path.shape[1])
     elif flaw == "hopeless":
-        rows = draw.choice([0, draw.integers(count)])
+        rows = draw.choice([0, int(draw.integers(count))])
         path[rows:] = draw.choice([math.nan, math.inf, path[0, 0]])
     return path
 

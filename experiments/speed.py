@@ -13,112 +13,41 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numba
 import numpy as np
 import pandas as pd
 import torch
 import typer
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.markdown import Markdown
 from scipy.integrate import solve_ivp
-from scipy.optimize import minimize_scalar
 from torch import Tensor, nn
 
 from baselines import SDSEF
-from experiments import report
+from experiments import figures, goals, loops, report
+from experiments.goals import Goal
 from latentds import ChebyshevDS, datasets, kernels
-from latentds.diffeomorphism import WIDTH_BOUND
-from latentds.fitting.embedding import chebyshev_columns, map_to_endpoints
 from latentds.fitting.matching import match
 from latentds.kernels.compiling import OPTIONS
 from latentds.kernels.dispatch import BLOCK
 from latentds.kernels.lanes import WIDTH, exp, load, store
 
+Array = NDArray[np.float64]
+
 N_LAYERS = 150
 SHOWN = datasets.unstable_spiral(7)
-
-# --- the rivals, as one writes them first -----------------------------------------------------------------------------
-
-Loop = list[tuple[Tensor, Tensor, Tensor]]
-"""(c, v, ρ) of every layer."""
-
-
-def loop_of(ds: ChebyshevDS) -> Loop:
-    psi = ds.diffeomorphism
-    return list(zip(*(part.detach() for part in (psi.centers, psi.directions, psi.widths)), strict=True))
-
-
-def loop_forward(layers: Loop, x: Tensor) -> Tensor:
-    for c, v, rho in layers:
-        x = x + torch.exp(-(rho**2) * ((x - c) ** 2).sum(-1, keepdim=True)) * v
-    return x
-
-
-def loop_inverse(layers: Loop, y: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
-    """x, and the gradient of each layer's weight with its direction, last layer first."""
-    steps = []
-    for c, v, rho in reversed(layers):
-        w = y - c
-        a, b, r = v @ v, (w * v).sum(-1, keepdim=True), (w * w).sum(-1, keepdim=True)
-        low, high, s = torch.zeros_like(b), torch.ones_like(b), torch.exp(-(rho**2) * r)
-        for _ in range(60):
-            k = torch.exp(-(rho**2) * (a * s * s - 2 * b * s + r))
-            gap = s - k
-            low, high = torch.where(gap < 0, s, low), torch.where(gap > 0, s, high)
-            new = s - gap / (1 - 2 * rho**2 * (b - a * s) * k)
-            new = torch.where((new < low) | (new > high), (low + high) / 2, new)
-            moved, s = (new - s).abs().max(), new
-            if moved < 1e-15:
-                break
-        y = y - s * v
-        steps.append((-2 * rho**2 * s * (y - c), v))
-    return y, steps
-
-
-def loop_velocity(layers: Loop, y: Tensor, latent_velocity: Callable[[Tensor], Tensor]) -> Tensor:
-    x, steps = loop_inverse(layers, y)
-    velocity = latent_velocity(x)
-    for gradient, v in reversed(steps):
-        velocity = velocity + (gradient * velocity).sum(-1, keepdim=True) * v
-    return velocity
-
-
-def runge_kutta(velocity: Callable[[Tensor], Tensor], y: Tensor, times: Tensor) -> Tensor:
-    path = [y]
-    for h in times.diff():
-        k1 = velocity(y)
-        k2 = velocity(y + h / 2 * k1)
-        k3 = velocity(y + h / 2 * k2)
-        k4 = velocity(y + h * k3)
-        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        path.append(y)
-    return torch.stack(path, dim=-2)
-
-
-def loop_match(x: np.ndarray, y: np.ndarray, n_layers: int, beta: float, mu: float) -> float:
-    """Greedy matching, one bounded scalar minimisation a layer; the mean squared error that it reaches."""
-    for _ in range(n_layers):
-        error = y - x
-        worst = int((error**2).sum(1).argmax())
-        v, squared = beta * error[worst], ((x - x[worst]) ** 2).sum(1)
-
-        def loss(rho: float, v: np.ndarray = v, squared: np.ndarray = squared, error: np.ndarray = error) -> float:
-            return float(((error - np.exp(-(rho**2) * squared)[:, None] * v) ** 2).sum())
-
-        rho = minimize_scalar(loss, bounds=(0, mu * WIDTH_BOUND / np.linalg.norm(v)), method="bounded").x
-        x = x + np.exp(-(rho**2) * squared)[:, None] * v
-    return float(((x - y) ** 2).mean())
-
 
 # --- the floor --------------------------------------------------------------------------------------------------------
 
 
 @numba.njit(**OPTIONS)
-def exponentials(buffer: np.ndarray, repeats: int) -> None:
+def exponentials(buffer: Array, repeats: int) -> None:
     """One exponential for each of ``BLOCK`` numbers in the L1 cache."""
     for _ in range(repeats):
         for u in range(0, BLOCK, WIDTH):
@@ -126,7 +55,7 @@ def exponentials(buffer: np.ndarray, repeats: int) -> None:
 
 
 @numba.njit(**OPTIONS)
-def products(buffer: np.ndarray, repeats: int) -> None:
+def products(buffer: Array, repeats: int) -> None:
     """Twelve independent chains of multiply-add in registers."""
     m = load(buffer, 0, WIDTH)
     a, b, c, d, e, f = m, m, m, m, m, m
@@ -145,7 +74,7 @@ def operations(dim: int) -> int:
 # --- timing -----------------------------------------------------------------------------------------------------------
 
 
-def take_turns(rivals: dict[str, Callable[[], Any]], rounds: int, share: float = 0.02) -> dict[str, np.ndarray]:
+def take_turns(rivals: Mapping[str, Callable[[], Any]], rounds: int, share: float = 0.02) -> dict[str, Array]:
     """CPU seconds a call, (rounds,) each: in each round, each rival runs for about ``share`` s, once at least."""
     counts = {}
     for name, call in rivals.items():
@@ -163,42 +92,18 @@ def take_turns(rivals: dict[str, Callable[[], Any]], rounds: int, share: float =
     return {name: np.array(values) for name, values in seconds.items()}
 
 
-class Goal(NamedTuple):
-    """One line of the table: ``low`` and ``high`` are quartiles over the rounds."""
-
-    what: str
-    unit: str
-    goal: str
-    reached: float
-    low: float
-    high: float
-    met: bool
-    note: str = ""
-
-    @classmethod
-    def of(
-        cls, what: str, unit: str, bound: float, values: np.ndarray, *, at_most: bool = False, note: str = ""
-    ) -> Goal:
-        reached, low, high = (float(np.quantile(values, q)) for q in (0.5, 0.25, 0.75))
-        met = reached <= bound if at_most else reached >= bound
-        return cls(what, unit, f"{'≤' if at_most else '≥'} {bound:g}", reached, low, high, met, note)
-
-    @classmethod
-    def ratio(cls, what: str, least: float, slow: np.ndarray, fast: np.ndarray) -> Goal:
-        """Of medians, with the quartiles of the ratio round by round."""
-        line = cls.of(what, "times faster", least, slow / fast)
-        reached = float(np.median(slow) / np.median(fast))
-        note = f"{_time(np.median(slow))} against {_time(np.median(fast))}"
-        return line._replace(reached=reached, met=reached >= least, note=note)
-
-
-def _time(seconds: float) -> str:
-    return next(
-        f"{seconds * scale:.3g} {unit}" for unit, scale in (("s", 1), ("ms", 1e3), ("µs", 1e6)) if seconds * scale >= 1
-    )
+def race(what: str, least: float, slow: Callable[[], Any], fast: Callable[[], Any], rounds: int) -> Goal:
+    """That ``fast`` is ``least`` times faster than ``slow``."""
+    times = take_turns({"slow": slow, "fast": fast}, rounds)
+    return goals.ratio(what, least, times["slow"], times["fast"])
 
 
 # --- studies ----------------------------------------------------------------------------------------------------------
+
+
+def few(rounds: int) -> int:
+    """Of what takes long."""
+    return max(3, rounds // 4)
 
 
 def latent_points(ds: ChebyshevDS, count: int, seed: int = 0) -> Tensor:
@@ -209,50 +114,46 @@ def latent_points(ds: ChebyshevDS, count: int, seed: int = 0) -> Tensor:
 
 
 def against_floor(ds: ChebyshevDS, rounds: int) -> list[Goal]:
-    layers, x = loop_of(ds), latent_points(ds, 100_000)
-    buffer, repeats = np.full(BLOCK, 0.5), 20_000
+    layers, x = loops.layers_of(ds), latent_points(ds, 100_000)
+    decode, buffer, repeats = partial(ds.decode, x), np.full(BLOCK, 0.5), 20_000
     times = take_turns(
         {
-            "decode": lambda: ds.decode(x),
-            "exponentials": lambda: exponentials(buffer, repeats),
-            "products": lambda: products(buffer, repeats),
+            "decode": decode,
+            "exponentials": partial(exponentials, buffer, repeats),
+            "products": partial(products, buffer, repeats),
         },
         rounds,
     )
     each_exp = times["exponentials"] / repeats / BLOCK
     each_product = times["products"] / repeats / 12 / WIDTH
     floor = (each_exp + operations(3) * each_product) * N_LAYERS * len(x)
-    loop = take_turns({"decode": lambda: ds.decode(x), "loop": lambda: loop_forward(layers, x)}, max(3, rounds // 4))
     note = (
         f"floor {np.median(floor) / N_LAYERS / len(x) * 1e9:.2f} ns a layer and point: exponential "
         f"{np.median(each_exp) * 1e9:.2f} ns, {operations(3)} operations of {np.median(each_product) * 1e9:.3f} ns"
     )
     return [
-        Goal.of("decode 10⁵ points", "times the floor", 2.5, times["decode"] / floor, at_most=True, note=note),
-        Goal.ratio("decode 10⁵ points, torch loop", 35, loop["loop"], loop["decode"]),
+        goals.median("decode 10⁵ points", "times the floor", 2.5, times["decode"] / floor, at_most=True, note=note),
+        race(
+            "decode 10⁵ points, torch loop", 35, partial(loops.forward, layers, x), partial(ds.decode, x), few(rounds)
+        ),
     ]
 
 
 def against_loop(ds: ChebyshevDS, rounds: int) -> list[Goal]:
-    layers, many = loop_of(ds), ds.decode(latent_points(ds, 1000))
-    one = SHOWN.positions[400]
-
-    def latent_velocity(x: Tensor) -> Tensor:
-        return ds.dynamics(x, x)
-
-    for points in (many, one):
-        torch.testing.assert_close(ds(points), loop_velocity(layers, points, latent_velocity), rtol=1e-8, atol=1e-8)
-    goals = []
-    for label, points, least in (("velocity of 1000 points", many, 80), ("velocity of one point, ds(y)", one, 100)):
-        times = take_turns(
-            {"fast": lambda p=points: ds(p), "loop": lambda p=points: loop_velocity(layers, p, latent_velocity)}, rounds
-        )
-        goals.append(Goal.ratio(f"{label}, torch loop", least, times["loop"], times["fast"]))
-    return goals
+    layers, many = loops.layers_of(ds), ds.decode(latent_points(ds, 1000))
+    found = []
+    for label, points, least in (
+        ("velocity of 1000 points", many, 80),
+        ("velocity of one point, ds(y)", SHOWN.positions[400], 100),
+    ):
+        fast, slow = partial(ds, points), partial(loops.velocity, layers, points, lambda x: ds.dynamics(x, x))
+        torch.testing.assert_close(fast(), slow(), rtol=1e-8, atol=1e-8)
+        found.append(race(f"{label}, torch loop", least, slow, fast, rounds))
+    return found
 
 
 def control_loop(calls: int) -> list[Goal]:
-    goals = []
+    found = []
     for n_layers, most in ((150, 60), (750, 120)):
         controller = ChebyshevDS(3, n_layers=n_layers).fit(SHOWN).controller()
         points, out = SHOWN.positions.numpy(), np.empty(3)
@@ -265,22 +166,22 @@ def control_loop(calls: int) -> list[Goal]:
                 seconds[i] = clock() - began
         micro = wall * 1e6
         label = f"controller(y), M = {n_layers}"
-        goals.append(Goal.of(f"{label}, median", "µs", most, micro, at_most=True))
+        found.append(goals.median(f"{label}, median", "µs", most, micro, at_most=True))
         late = float(np.quantile(micro, 0.99))
         note = f"worst of {calls}: {micro.max():.0f} µs; of CPU time {np.quantile(busy, 0.99) * 1e6:.0f} µs"
-        goals.append(Goal(f"{label}, 99th percentile", "µs", "≤ 1000", late, late, late, late <= 1000, note))
-    return goals
+        slow = goals.at_most(f"{label}, 99th percentile", pd.Series([late]), 1000)
+        found.append(slow._replace(unit="µs", note=note))
+    return found
 
 
 def rollouts(ds: ChebyshevDS, rounds: int) -> list[Goal]:
     generator = torch.Generator().manual_seed(0)
     starts = SHOWN.start + 0.1 * torch.randn(16, 3, generator=generator, dtype=torch.float64)
     times = torch.linspace(0, SHOWN.duration, 1000, dtype=torch.float64)
-    clock = take_turns(
-        {"fast": lambda: ds.rollout(starts, times), "rk4": lambda: runge_kutta(ds, starts, times)}, max(3, rounds // 4)
-    )
+    fast, slow = partial(ds.rollout, starts, times), partial(loops.runge_kutta, ds, starts, times)
+    clock = take_turns({"fast": fast, "rk4": slow}, few(rounds))
     controller = ds.controller()
-    found = ds.rollout(starts, times)
+    found = fast()
     began, worst = time.thread_time(), 0.0
     for start, path in zip(starts.numpy(), found.numpy(), strict=True):
         exact = solve_ivp(
@@ -288,43 +189,27 @@ def rollouts(ds: ChebyshevDS, rounds: int) -> list[Goal]:
         )
         worst = max(worst, float(np.abs(exact.y.T - path).max()))
     seconds = np.array([time.thread_time() - began])
-    coarse = float((runge_kutta(ds, starts, times) - found).abs().max())
+    coarse = float((slow() - found).abs().max())
     return [
-        Goal.ratio("rollout 16 x 1000, RK4 on ds(y)", 60, clock["rk4"], clock["fast"]),
-        Goal.ratio("rollout 16 x 1000, dopri5 on controller(y)", 60, seconds, clock["fast"]),
-        Goal.of(
-            "rollout, distance from dopri5 (rtol 1e-9)",
-            "units",
-            1e-6,
-            np.array([worst]),
-            at_most=True,
-            note=f"RK4 of 1000 steps: {coarse:.1e}",
+        goals.ratio("rollout 16 x 1000, RK4 on ds(y)", 60, clock["rk4"], clock["fast"]),
+        goals.ratio("rollout 16 x 1000, dopri5 on controller(y)", 60, seconds, clock["fast"]),
+        goals.at_most("rollout, distance from dopri5 (rtol 1e-9)", pd.Series([worst]), 1e-6)._replace(
+            unit="units", note=f"RK4 of 1000 steps: {coarse:.1e}"
         ),
     ]
 
 
 def fits(rounds: int) -> list[Goal]:
-    y = SHOWN.positions.numpy()
-    x = map_to_endpoints(chebyshev_columns(len(y), 3)[::-1], y[0], y[-1])
-    slow: list[float] = []
-    times = take_turns(
-        {"fast": lambda: match(x, y, 300, 0.5, 0.9), "bounded": lambda: slow.append(loop_match(x, y, 300, 0.5, 0.9))},
-        max(3, rounds // 4),
-    )
+    x, y = ChebyshevDS.latent_line(SHOWN), SHOWN.positions.numpy()
+    fast, slow = partial(match, x, y, 300, 0.5, 0.9), partial(loops.match, x, y, 300, 0.5, 0.9)
     psi = ChebyshevDS(3, n_layers=300).diffeomorphism
-    psi.assign(*(torch.from_numpy(part) for part in match(x, y, 300, 0.5, 0.9)))
+    psi.assign(*(torch.from_numpy(part) for part in fast()))
     error = float((psi(torch.from_numpy(x)) - SHOWN.positions).square().mean())
-    note = f"MSE {error:.3g} against {slow[-1]:.3g}"
+    theirs = slow()
+    note = f"MSE {error:.3g} against {theirs:.3g}"
     return [
-        Goal.ratio("fit, M = 300, N = 1000, bounded scalar search", 30, times["bounded"], times["fast"]),
-        Goal.of(
-            "fit, MSE over that of the bounded search",
-            "ratio",
-            1,
-            np.array([error / slow[-1]]),
-            at_most=True,
-            note=note,
-        ),
+        race("fit, M = 300, N = 1000, bounded scalar search", 30, slow, fast, few(rounds)),
+        goals.at_most("fit, MSE over that of the bounded search", pd.Series([error / theirs]), 1)._replace(note=note),
     ]
 
 
@@ -355,14 +240,14 @@ def sdsef_step(rounds: int) -> list[Goal]:
     def step(direction: Callable[[], Tensor]) -> Tensor:
         optimizer.zero_grad()
         loss = nn.functional.smooth_l1_loss(-network(points).exp() * direction(), wanted)
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
-        return torch.cat([p.grad.flatten() for p in psi.parameters()])
+        return torch.cat([p.grad.flatten() for p in psi.parameters() if p.grad is not None])
 
     with torch.enable_grad():
         torch.testing.assert_close(step(back_sweep), step(inverted), rtol=1e-2, atol=1e-4)
-        times = take_turns({"fast": lambda: step(back_sweep), "inverted": lambda: step(inverted)}, rounds)
-    return [Goal.ratio("SDS-EF training step, J by autograd and solve", 6, times["inverted"], times["fast"])]
+        what = "SDS-EF training step, J by autograd and solve"
+        return [race(what, 6, partial(step, inverted), partial(step, back_sweep), rounds)]
 
 
 def growth(quick: bool) -> pd.DataFrame:
@@ -372,20 +257,18 @@ def growth(quick: bool) -> pd.DataFrame:
     for count in (1, 10, 100, 1000, 10_000, 100_000) if quick else (1, 10, 100, 1000, 10_000, 100_000, 1_000_000):
         x = latent_points(ds, count)
         y = ds.decode(x)
-        calls = {"decode": lambda x=x: ds.decode(x), "encode": lambda y=y: ds.encode(y), "velocity": lambda y=y: ds(y)}
+        calls = {"decode": partial(ds.decode, x), "encode": partial(ds.encode, y), "velocity": partial(ds, y)}
         for call, values in take_turns(calls, 5).items():
             rows.append(("N", call, count, float(np.median(values))))
     for n_layers in (25, 50, 100, 200, 400, 800):
         ds = ChebyshevDS(3, n_layers=n_layers).fit(SHOWN)
         y = ds.decode(latent_points(ds, 10_000))
-        calls = {"velocity": lambda ds=ds, y=y: ds(y), "fit": lambda ds=ds: ds.fit(SHOWN)}
-        for call, values in take_turns(calls, 3).items():
+        for call, values in take_turns({"velocity": partial(ds, y), "fit": partial(ds.fit, SHOWN)}, 3).items():
             rows.append(("M", call, n_layers, float(np.median(values))))
     for count in (125, 250, 500, 1000, 2000, 4000, 8000):
         shown = datasets.unstable_spiral(7, count)
-        points = shown.positions.numpy()
-        x = map_to_endpoints(chebyshev_columns(count, 3)[::-1], points[0], points[-1])
-        values = take_turns({"match": lambda x=x, p=points: match(x, p, N_LAYERS, 0.5, 0.9)}, 5)["match"]
+        fit = partial(match, ChebyshevDS.latent_line(shown), shown.positions.numpy(), N_LAYERS, 0.5, 0.9)
+        values = take_turns({"match": fit}, 5)["match"]
         rows.append(("N", "match", count, float(np.median(values))))
     return pd.DataFrame(rows, columns=["grows", "call", "size", "seconds"])
 
@@ -401,20 +284,6 @@ def exponents(curves: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["grows", "call", "from", "to", "exponent"])
 
 
-def draw(curves: pd.DataFrame, path: Path) -> None:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    for axis, (grows, label) in zip(figure.subplots(1, 2), (("N", "points N"), ("M", "layers M")), strict=True):
-        for call, curve in curves[curves["grows"] == grows].groupby("call"):
-            axis.loglog(curve["size"], curve["seconds"], "o-", label=call, markersize=3)
-        axis.set(xlabel=label, ylabel="seconds")
-        axis.xaxis.set_minor_formatter("")
-        axis.grid(alpha=0.3)
-        axis.legend(frameon=False)
-    figure.savefig(path, dpi=150)
-
-
 def main(
     quick: Annotated[bool, typer.Option(help="Fewer rounds and no million points: under a minute.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for tables, curves and the picture.")] = Path("results/speed"),
@@ -425,7 +294,7 @@ def main(
     console, rounds = Console(), 9 if quick else 41
     kernels.warmup([3])
     ds = ChebyshevDS(3, n_layers=N_LAYERS).fit(SHOWN)
-    goals = [
+    found = [
         *against_floor(ds, rounds),
         *against_loop(ds, rounds),
         *control_loop(2000 if quick else 20_000),
@@ -437,33 +306,19 @@ def main(
     summary = "\n\n".join(
         [
             f"Load average while it ran: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; 1 core is used.",
+            goals.table(found),
             report.table(
-                ("What", "Goal", "Reached", "Quartiles", "Unit", "Met", "Note"),
-                [
-                    (
-                        g.what,
-                        g.goal,
-                        f"{g.reached:.3g}",
-                        f"{g.low:.3g} to {g.high:.3g}",
-                        g.unit,
-                        "yes" if g.met else "NO",
-                        g.note,
-                    )
-                    for g in goals
-                ],
-            ),
-            report.table(
-                ("Grows", "Call", "From", "To", "Exponent of the time"),
+                ("grows", "call", "from", "to", "exponent of the time"),
                 [(*map(str, row[:-1]), f"{row[-1]:.2f}") for row in exponents(curves).itertuples(index=False)],
             ),
         ]
     )
     out.mkdir(parents=True, exist_ok=True)
-    report.write(out / "goals.csv", pd.DataFrame(goals).to_csv(index=False))
+    report.write(out / "goals.csv", pd.DataFrame(found).to_csv(index=False))
     report.write(out / "growth.csv", curves.to_csv(index=False))
     report.write(out / "summary.md", summary + "\n")
     report.write(out / "environment.json", report.environment())
-    draw(curves, out / "growth.png")
+    figures.growth(curves).savefig(out / "growth.png", dpi=150)
     console.print(Markdown(summary))
     console.print(f"{out}: summary.md, goals.csv, growth.csv, growth.png, environment.json")
 

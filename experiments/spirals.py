@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import joblib
 import numpy as np
@@ -21,64 +21,13 @@ import pandas as pd
 import typer
 from rich.console import Console
 from rich.markdown import Markdown
-from scipy import stats
 
-from baselines import FDM, SDSEF
-from experiments import report
-from latentds import ChebyshevDS, Demonstration, TubeDS, datasets, plotting
-from latentds.benchmark import COLUMNS, Cell, Factory, Outcome, Protocol, run
-
-
-class Setting(NamedTuple):
-    """Of the greedy matching; ``mse`` is what the paper reached with it."""
-
-    beta: float
-    mu: float
-    n_layers: int
-    mse: float | None = None
-
-
-# The paper's Table I.
-CHEBYSHEV = {
-    "unstable c=1": Setting(0.9, 0.6, 50, 7.38e-7),
-    "unstable c=3": Setting(0.9, 0.8, 75, 5.73e-7),
-    "unstable c=7": Setting(0.5, 0.9, 175, 7.26e-6),
-    "unstable c=10": Setting(0.4, 0.9, 300, 9.51e-6),
-    "unstable c=15": Setting(0.3, 0.8, 750, 1.62e-5),
-}
-STRAIGHT = {
-    "unstable c=1": Setting(0.9, 0.8, 50, 2.52e-8),
-    "unstable c=3": Setting(0.9, 0.9, 75, 9.64e-8),
-    "unstable c=7": Setting(0.6, 0.9, 150, 3.35e-6),
-    "unstable c=10": Setting(0.5, 0.9, 300, 5.39e-6),
-    "unstable c=15": Setting(0.3, 0.8, 750, 1.56e-5),
-}
-# The paper gives none for the stable spirals. Of 27 tried (β .2, .3, .4; μ .7, .8, .9; M 400, 600, 800), the same for
-# both methods, this has the lowest mean DTW summed over both and all five, but for M = 800, which gains 0.2 %.
-STABLE = Setting(0.3, 0.9, 600)
-RIVALS = ("Chebyshev", "FDM")
-"""The two that the p-values compare."""
-
-
-def methods(spiral: str, quick: bool) -> dict[str, Factory]:
-    """A column of the tables each; the factory's arguments may depend on the spiral."""
-    ours, straight = CHEBYSHEV.get(spiral, STABLE), STRAIGHT.get(spiral, STABLE)
-    return {
-        "Chebyshev": lambda dim: ChebyshevDS(dim, n_layers=ours.n_layers, beta=ours.beta, mu=ours.mu),
-        "FDM": lambda dim: FDM(dim, n_layers=straight.n_layers, beta=straight.beta, mu=straight.mu),
-        "SDS-EF": lambda dim: SDSEF(dim, **sdsef_size(quick)),
-        "TubeDS": lambda dim: TubeDS(dim),
-    }
-
-
-def sdsef_size(quick: bool) -> dict[str, int]:
-    return {"n_layers": 5, "n_features": 80} if quick else {"n_layers": 10, "n_features": 200}
-
-
-def spirals(quick: bool) -> list[Demonstration]:
-    if quick:
-        return [datasets.unstable_spiral(3), datasets.unstable_spiral(7), datasets.stable_spiral(2)]
-    return datasets.spiral_suite()
+from experiments import report, scores
+from experiments.methods import RIVALS, methods
+from experiments.motions import spirals
+from experiments.published import TABLE_ONE
+from latentds import Demonstration, plotting
+from latentds.benchmark import COLUMNS, Cell, Outcome, Protocol, run
 
 
 def main(
@@ -111,9 +60,7 @@ def main(
         settings = {
             "command": {"quick": quick, "jobs": jobs, "seeds": seeds, "seconds": round(seconds, 1)},
             "protocol": asdict(Protocol()),
-            "Chebyshev": {d.name: CHEBYSHEV.get(d.name, STABLE)._asdict() for d in shown},
-            "FDM": {d.name: STRAIGHT.get(d.name, STABLE)._asdict() for d in shown},
-            "SDS-EF": sdsef_size(quick),
+            "methods": {d.name: {m: f(d.dim).settings for m, f in methods(d.name, quick).items()} for d in shown},
         }
         summary = summarize(rows, [d.name for d in shown], list(methods(shown[0].name, quick)))
         report.write(out / "rows.csv", rows.to_csv(index=False))
@@ -140,20 +87,20 @@ def cluster(address: str | None) -> Iterator[None]:
         yield
 
 
-def summarize(rows: pd.DataFrame, spirals: list[str], labels: list[str]) -> str:
+def summarize(rows: pd.DataFrame, names: list[str], labels: list[str]) -> str:
     """The tables, as Markdown."""
     near, demonstrated = rows[rows["start"] > 0], rows[rows["start"] == 0]
     parts = []
-    for family in dict.fromkeys(name.split()[0] for name in spirals):
-        names = [name for name in spirals if name.startswith(family)]
+    for family in dict.fromkeys(name.split()[0] for name in names):
+        some = [name for name in names if name.startswith(family)]
         title = f"{family.capitalize()} spirals"
-        parts += [f"## {title}: exact DTW over the perturbed starts, mean ± sd", _scores(near, "dtw", names, labels)]
-        parts += [f"## {title}: FastDTW (radius 1), as in the paper", _scores(near, "dtw_fast", names, labels)]
-        parts += [f"## {title}: exact DTW from the demonstrated start", _scores(demonstrated, "dtw", names, labels)]
+        parts += [f"## {title}: exact DTW over the perturbed starts, mean ± sd", _scores(near, "dtw", some, labels)]
+        parts += [f"## {title}: FastDTW (radius 1), as in the paper", _scores(near, "dtw_fast", some, labels)]
+        parts += [f"## {title}: exact DTW from the demonstrated start", _scores(demonstrated, "dtw", some, labels)]
         if demonstrated["seed"].nunique() > 1:
-            parts += [f"## {title}: the same, seed by seed", _by_seed(demonstrated, names)]
+            parts += [f"## {title}: the same, seed by seed", _by_seed(demonstrated, some)]
     parts.append(NOTES)
-    if known := [name for name in spirals if name in CHEBYSHEV]:
+    if known := [name for name in names if name in TABLE_ONE[RIVALS[0]]]:
         parts += ["## Fit: mean squared error per coordinate beside the paper's Table I", _table_one(rows, known)]
     parts += ["## Rollouts that failed, diverged or did not converge", _failures(rows)]
     return "# Ten spirals\n\n" + "\n\n".join(parts) + "\n"
@@ -197,18 +144,17 @@ def _by_seed(rows: pd.DataFrame, names: list[str]) -> str:
 def _p_values(first: pd.Series, second: pd.Series) -> str:
     if len(first) < 2 or len(first) != len(second) or not np.isfinite([*first, *second]).all():
         return "—"
-    paired = stats.ttest_rel(first, second).pvalue
-    welch = stats.ttest_ind(first, second, equal_var=False).pvalue
-    return f"{paired:.1e} / {welch:.1e}"
+    return f"{scores.paired(first, second):.1e} / {scores.welch(first, second):.1e}"
 
 
 def _table_one(rows: pd.DataFrame, names: list[str]) -> str:
     lines = []
     for name in names:
         line = [name]
-        for label, settings in zip(RIVALS, (CHEBYSHEV, STRAIGHT), strict=True):
+        for label in RIVALS:
             reached = rows[(rows["demonstration"] == name) & (rows["method"] == label)]["mse"].mean()
-            line += [f"{reached:.2e}", f"{settings[name].mse:.2e}", f"{reached / settings[name].mse:.2f}"]
+            paper = TABLE_ONE[label][name].mse
+            line += [f"{reached:.2e}", f"{paper:.2e}", f"{reached / paper:.2f}"]
         lines.append(line)
     return report.table(["spiral", *(f"{r}{what}" for r in RIVALS for what in ("", ", paper", ", ratio"))], lines)
 

@@ -9,10 +9,11 @@ import torch
 from scipy import stats
 
 from baselines import FDM
-from latentds import ChebyshevDS, Demonstration, StableDS, datasets, metrics
+from latentds import ChebyshevDS, Demonstration, StableDS, TubeDS, datasets, metrics
 from latentds.base import FitReport
 from latentds.benchmark import COLUMNS, Cell, Protocol, compare, run
 from latentds.fitting.matching import PINS
+from latentds.store import CellStore
 
 SPIRAL = datasets.unstable_spiral(1, 60)
 TIMES = ["fit_seconds", "rollout_seconds"]
@@ -66,6 +67,18 @@ class Slow(Straight):
         super().fit(demonstration)
         self.rate.fill_(0.01)
         return self
+
+
+class Several(Straight):
+    """Learns the goal of the first."""
+
+    def fit(self, demonstration, *, progress=False):
+        return super().fit(demonstration[0])
+
+
+class Unfit(Straight):
+    def fit(self, demonstration, *, progress=False):
+        raise RuntimeError("cannot learn this")
 
 
 def refuse(dim):
@@ -136,18 +149,18 @@ def test_nothing_global_changes():
     torch.manual_seed(7)
     before = torch.get_rng_state(), torch.get_num_threads(), torch.get_default_dtype(), torch.is_grad_enabled()
     numpy_before = np.random.get_state()[1].copy()  # noqa: NPY002
-    compare({"random": Straight, "bad": refuse, **SMALL}, SPIRAL, **QUICK)
+    with pytest.warns(RuntimeWarning):
+        compare({"random": Straight, "bad": Unfit, **SMALL}, SPIRAL, **QUICK)
     after = torch.get_rng_state(), torch.get_num_threads(), torch.get_default_dtype(), torch.is_grad_enabled()
     assert torch.equal(before[0], after[0])
     assert before[1:] == after[1:]
     assert (np.random.get_state()[1] == numpy_before).all()  # noqa: NPY002
 
 
-@pytest.mark.parametrize(
-    "bad", [refuse, Lone, lambda dim: 3, lambda dim: ChebyshevDS(dim + 1), lambda dim: FDM(dim, beta=-1)]
-)
+@pytest.mark.parametrize("bad", [Lone, Unfit])
 def test_a_method_that_raises_becomes_rows_that_say_so(bad):
-    rows = compare({"bad": bad, "good": Straight}, SPIRAL, **QUICK)
+    with pytest.warns(RuntimeWarning, match="compare: 4 of 8 rows failed, their scores are NaN: 4 of 'bad', .*Error: "):
+        rows = compare({"bad": bad, "good": Straight}, SPIRAL, **QUICK)
     failed = rows[rows["method"] == "bad"]
     assert len(failed) == 4
     assert (failed["status"] == "failed").all()
@@ -155,6 +168,37 @@ def test_a_method_that_raises_becomes_rows_that_say_so(bad):
     assert failed[["dtw", "dtw_fast", "frechet"]].isna().all(axis=None)
     assert not failed["converged"].any()
     assert (rows[rows["method"] == "good"]["status"] == "ok").all()
+
+
+@pytest.mark.parametrize(
+    ("bad", "told"),
+    [
+        (FDM(3), r"a callable\(dim\), got a FDM for 'bad': write lambda dim: FDM\(dim\)"),
+        (refuse, "'bad' to make a StableDS, got RuntimeError: no such thing"),
+        (lambda dim: 3, "'bad' to make a StableDS, got TypeError: expected a StableDS, got int"),
+        (lambda dim: ChebyshevDS(dim + 1), "'bad' to make a StableDS, got ValueError: expected a system of 3 dim"),
+        (lambda dim: FDM(dim, beta=-1), "'bad' to make a StableDS, got ValueError: beta: expected a number in"),
+    ],
+)
+def test_a_method_that_cannot_be_made_is_refused_before_any_work(bad, told):
+    def work(dim):
+        ds = Straight(dim)
+        ds.fit = lambda demonstration: pytest.fail("work was done")
+        return ds
+
+    with pytest.raises(ValueError, match=f"^methods: expected {told}"):
+        compare({"good": work, "bad": bad}, SPIRAL, **QUICK)
+
+
+@pytest.mark.parametrize("bad", [refuse, lambda dim: 3])
+def test_a_cell_that_cannot_be_made_tells_it_in_its_rows(bad):
+    (outcome,) = run([Cell("bad", bad, SPIRAL)], Protocol(n_starts=1, n_points=20), n_jobs=1)
+    assert [row["status"] for row in outcome.rows] == ["failed"] * 2
+
+
+def test_without_failures_nothing_is_warned_of(recwarn):
+    compare({"good": Straight}, SPIRAL, **QUICK)
+    assert not [warning for warning in recwarn if issubclass(warning.category, RuntimeWarning)]
 
 
 def test_a_rollout_that_diverges_is_told_start_by_start():
@@ -236,6 +280,110 @@ def test_bad_input_is_named_before_any_work(change, named):
 
     with pytest.raises(ValueError, match=f"^{named}: expected"):
         compare(**{"methods": {"m": work}, "demonstrations": SPIRAL, "n_jobs": 1, **change})
+
+
+def moved(name, by=0.1, every=1):
+    """The spiral shown otherwise: off at first, to the same goal."""
+    shift = by * torch.linspace(1, 0, len(SPIRAL), dtype=torch.float64).unsqueeze(1)
+    return Demonstration((SPIRAL.positions + shift)[::every], every * SPIRAL.dt, name)
+
+
+OTHERS = [moved("low", -0.1), moved("high", 0.1), moved("slow", 0.2, 2)]
+
+
+def test_others_may_judge():
+    """One is shown; rollouts begin, last and are scored as each judge does."""
+    rows = compare(SMALL, SPIRAL, judged_by=OTHERS, **QUICK | {"n_starts": 0})
+    assert tuple(rows.columns) == (*COLUMNS[:2], "judge", *COLUMNS[2:])
+    judged = [(m, SPIRAL.name, d.name, i) for m in SMALL for i, d in enumerate(OTHERS)]
+    assert list(rows[["method", "demonstration", "judge", "start"]].itertuples(index=False, name=None)) == judged
+    ds = ChebyshevDS(3, n_layers=8).fit(SPIRAL)
+    for judge, (_, row) in zip(OTHERS, rows[rows["method"] == "Chebyshev"].iterrows(), strict=True):
+        times = torch.linspace(0, judge.duration, 50, dtype=torch.float64)
+        with torch.no_grad():
+            path, velocities = ds.rollout(judge.start, times), ds(judge.positions)
+        assert row["dtw"] == pytest.approx(metrics.dtw(path, judge.at(times.numpy())), rel=1e-6)
+        assert row["velocity_rmse"] == pytest.approx(metrics.velocity_rmse(velocities, judge.velocities), rel=1e-6)
+        assert row["mse"] == pytest.approx(ds.fit_report.mse)
+
+
+def test_every_judge_has_its_perturbed_starts():
+    protocol = Protocol(n_starts=2, n_points=20)
+    (outcome,) = run([Cell("m", Straight, SPIRAL, judges=OTHERS)], protocol, n_jobs=1)
+    assert [row["start"] for row in outcome.rows] == list(range(9))
+    assert [row["judge"] for row in outcome.rows] == [d.name for d in OTHERS for _ in range(3)]
+    assert np.allclose(outcome.paths[:, 0], torch.cat([protocol.starts(judge) for judge in OTHERS]))
+
+
+def test_several_may_be_shown_as_one_motion():
+    """They are fitted together, and without other judges each judges."""
+    cut = [OTHERS[:2], [SPIRAL]]
+    tube = {"TubeDS": lambda dim: TubeDS(dim, n_layers=20, refined=False)}
+    rows = compare(tube, cut, judged_by=[OTHERS[2], OTHERS], **QUICK | {"n_starts": 0})
+    assert list(rows["demonstration"]) == ["low + high"] + ["unstable c=1"] * 3
+    assert list(rows["judge"]) == ["slow", "low", "high", "slow"]
+    ds = tube["TubeDS"](3).fit(OTHERS[:2])
+    with torch.no_grad():
+        path = ds.rollout(OTHERS[2].start, torch.linspace(0, OTHERS[2].duration, 50, dtype=torch.float64))
+    reference = Protocol(n_points=50).reference(OTHERS[2])
+    assert rows["dtw"][0] == pytest.approx(metrics.dtw(path, reference), rel=1e-6)
+    assert list(compare(tube, [OTHERS[:2]], **QUICK | {"n_starts": 0})["judge"]) == ["low", "high"]
+
+
+def test_a_demonstration_that_judges_itself_is_nothing_new():
+    plain = compare({"m": Straight}, SPIRAL, **QUICK)
+    again = compare({"m": Straight}, [[SPIRAL]], judged_by=[SPIRAL], **QUICK)
+    assert plain.drop(columns=TIMES).equals(again.drop(columns=TIMES))
+
+
+def test_judges_and_what_is_measured_tell_kept_cells_apart(tmp_path):
+    def least(ds, cell):
+        return {"least": float(ds.rate)}
+
+    def most(ds, cell):
+        return {"most": float(ds.rate)}
+
+    protocol, found = Protocol(n_starts=0, n_points=20), []
+    for settings in ({}, {"judges": OTHERS}, {"judges": OTHERS[:2]}, {"measure": least}, {"measure": most}):
+        (outcome,) = run([Cell("m", Straight, SPIRAL, **settings)], protocol, n_jobs=1, store=tmp_path / "cells")
+        found.append(outcome)
+    for both in ([SPIRAL, *OTHERS], [*OTHERS, SPIRAL]):
+        (outcome,) = run([Cell("m", Several, both, judges=SPIRAL)], protocol, n_jobs=1, store=tmp_path / "cells")
+    assert [len(outcome.rows) for outcome in found] == [1, 3, 2, 1, 1]
+    with CellStore(tmp_path / "cells") as store:
+        assert len(store) == 7
+    assert found[3].rows[0]["least"] == found[4].rows[0]["most"] > 1
+    assert "least" not in found[0].rows[0]
+
+
+def test_what_is_measured_hides_no_column():
+    cell = Cell("m", Straight, SPIRAL, measure=lambda ds, cell: {"mse": 0.0, "more": 1.0})
+    (outcome,) = run([cell], Protocol(n_starts=0, n_points=20), n_jobs=1)
+    assert "measure: expected names that rows do not have, got ['mse']" in outcome.rows[0]["error"]
+
+
+@pytest.mark.parametrize(
+    ("shown", "judges", "named"),
+    [
+        (SPIRAL, datasets.archimedean_spiral(40), "judged_by: expected demonstrations of 3 dimensions"),
+        ([[SPIRAL, datasets.archimedean_spiral(40)]], None, "demonstrations: expected demonstrations of 3 dimensions"),
+        ([SPIRAL], OTHERS, "judged_by: expected one item for each of the 1 motions"),
+        ([SPIRAL], SPIRAL, "judged_by: expected one item for each of the 1 motions"),
+        (SPIRAL, [], "judged_by: expected a Demonstration or a non-empty"),
+        ([[]], None, "demonstrations: expected a Demonstration or a non-empty"),
+        ([[SPIRAL], SPIRAL], None, "demonstrations: expected each only once"),
+        ([[SPIRAL, SPIRAL], SPIRAL], None, "demonstrations: expected each only once"),
+    ],
+)
+def test_bad_judges_are_refused(shown, judges, named):
+    with pytest.raises(ValueError, match=f"^{named}"):
+        compare({"m": Straight}, shown, judged_by=judges, **QUICK)
+
+
+@pytest.mark.parametrize("name", ["shown", "judges"])
+def test_a_cell_names_what_is_wrong(name):
+    with pytest.raises(ValueError, match=f"^{name}: expected a Demonstration"):
+        Cell("m", Straight, **{"shown": SPIRAL, "judges": SPIRAL, name: []})
 
 
 def test_cells_that_are_alike_are_refused():

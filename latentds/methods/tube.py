@@ -94,18 +94,31 @@ class TubeDS(LatentDS):
         contraction: κ > 0, per duration of the demonstration: a start off the path comes back within about
             3/κ of it. A larger κ costs proportionally larger velocity gradients (see the report).
         refined: whether L-BFGS refines the match; without it a fit takes a tenth of the time.
+        homotopy: the one that matching may follow, "linear" or "curvature" (n >= 2), or "both".
     """
 
     diffeomorphism: LocallyWeightedTranslations
     dynamics: TubeDynamics
     report_type = TubeReport
 
-    def __init__(self, dim: int, *, n_layers: int = 300, contraction: float = 20.0, refined: bool = True) -> None:
+    def __init__(
+        self,
+        dim: int,
+        *,
+        n_layers: int = 300,
+        contraction: float = 20.0,
+        refined: bool = True,
+        homotopy: str = "both",
+    ) -> None:
         along, across = PiecewiseLinearLaw.uniform(), PiecewiseLinearLaw(torch.ones(1), torch.ones(1))
         super().__init__(dim, LocallyWeightedTranslations(dim, n_layers), TubeDynamics(dim, along, across))
         self.n_layers = self.diffeomorphism.n_layers
         self.contraction = number_in(contraction, "contraction", 0, float("inf"))
         self.refined = bool(refined)
+        known = ("linear", "curvature", "both") if self.dim > 1 else ("linear", "both")
+        if homotopy not in known:
+            raise ValueError(f"homotopy: expected one of {known} in {self.dim} dimensions, got {homotopy!r}")
+        self.homotopy = homotopy
 
     def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> TubeDS:
         began = time.perf_counter()
@@ -119,7 +132,7 @@ class TubeDS(LatentDS):
         with restore_on_failure(self, shown):
             law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
             judged = []
-            for candidate in _candidates(path, self.diffeomorphism.n_layers):
+            for candidate in _candidates(path, self.diffeomorphism.n_layers, self.homotopy):
                 self._take(candidate, shape, law)
                 judged.append((self._score(shape), candidate))
             judged.sort(key=lambda pair: pair[0])
@@ -225,8 +238,8 @@ class Candidate(NamedTuple):
         return float(np.square(apply_layers(self.layers, self.line) - path).mean())
 
 
-def _candidates(path: Array, n_layers: int) -> Iterator[Candidate]:
-    """Matches of a line to the path (N, n), along either homotopy."""
+def _candidates(path: Array, n_layers: int, homotopy: str) -> Iterator[Candidate]:
+    """Matches of a line to the path (N, n), along either homotopy or the one that is asked for."""
     apart = float(np.linalg.norm(np.diff(path, axis=0), axis=1).max())  # less where a corner is cut
     chord = map_to_endpoints(straight_column(len(path)), path[0], path[-1])
     middle = chord.mean(0)
@@ -235,10 +248,10 @@ def _candidates(path: Array, n_layers: int) -> Iterator[Candidate]:
         return Candidate(isotopy, match_along(curves, n_layers, 0.9, 0.9, width * apart), curves[0])
 
     most = max(1, n_layers // 10)
-    for steps, stretch in LINEAR:
+    for steps, stretch in LINEAR if homotopy != "curvature" else ():
         line = middle + stretch * (chord - middle)
         yield matched("straight", linear_homotopy(line, path, min(steps, most)), WIDTH)
-    if path.shape[1] > 1:
+    if path.shape[1] > 1 and homotopy != "linear":
         for steps, widths in CURVATURE:
             curves = curvature_homotopy(path, min(steps, most))
             for width in widths:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,21 +18,13 @@ from latentds import Demonstration, datasets
 from latentds.testing import wavy_motion
 
 
-@pytest.fixture(autouse=True)
-def _short_training(monkeypatch):
-    for recipe, plan in baselines.sdsef.PLANS.items():
-        monkeypatch.setitem(baselines.sdsef.PLANS, recipe, replace(plan, epochs=20))
-
-
 def small(dim=3, **settings):
-    return SDSEF(dim, **{"n_layers": 4, "n_features": 30, "seed": 0, **settings})
+    return SDSEF(dim, **{"n_layers": 4, "n_features": 30, "seed": 0, "epochs": 20, **settings})
 
 
 @pytest.fixture(scope="module")
 def fitted():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(baselines.sdsef.PLANS, "tuned", replace(baselines.sdsef.PLANS["tuned"], epochs=60))
-        return small(seed=1).fit(wavy_motion(3))
+    return small(seed=1, epochs=60).fit(wavy_motion(3))
 
 
 def test_rollout_is_the_integral_of_the_velocity(fitted):
@@ -105,12 +96,11 @@ def test_a_coordinate_at_rest_stays_at_rest():
     assert float((path[:, 3] - 5).abs().max()) < 1e-3 * shown.size
 
 
-def test_learns_from_several(monkeypatch):
-    monkeypatch.setitem(baselines.sdsef.PLANS, "tuned", replace(baselines.sdsef.PLANS["tuned"], epochs=60))
+def test_learns_from_several():
     one = wavy_motion(3)
     other = Demonstration(one.positions[::2] + 0.1 * (1 - torch.linspace(0, 1, 100).unsqueeze(1)), 2 * one.dt)
     other = Demonstration(torch.cat([other.positions, one.goal.expand(1, 3)]), 2 * one.dt)
-    ds = small().fit([one, other])
+    ds = small(epochs=60).fit([one, other])
     assert torch.equal(ds.attractor, one.goal)
     assert ds.fit_report.mse < 0.5 * float(one.velocities.square().mean())
 
@@ -162,11 +152,27 @@ def test_float32_rests_at_the_goal(fitted):
 
 @pytest.mark.parametrize(
     ("argument", "value"),
-    [("dim", 0), ("n_layers", 0), ("n_features", -1), ("recipe", "best"), ("seed", -1), ("seed", 0.5)],
+    [
+        ("dim", 0),
+        ("n_layers", 0),
+        ("n_features", -1),
+        ("recipe", "best"),
+        ("seed", -1),
+        ("seed", 0.5),
+        ("epochs", 0),
+        ("epochs", 1.5),
+    ],
 )
 def test_bad_arguments_are_named(argument, value):
     with pytest.raises(ValueError, match=f"^{argument}: expected"):
         SDSEF(**{"dim": 3, argument: value})
+
+
+@pytest.mark.parametrize(("recipe", "dim", "most"), [("official", 3, 7), ("tuned", 2, 7), ("tuned", 3, 40)])
+def test_epochs_are_as_many_as_asked_for(recipe, dim, most):
+    ds = small(dim, recipe=recipe, epochs=most).fit(wavy_motion(dim))
+    assert len(ds.fit_report.history) == most
+    assert ds.settings["epochs"] == most
 
 
 def test_a_closed_loop_is_refused():
@@ -177,12 +183,11 @@ def test_a_closed_loop_is_refused():
         small(2).fit(Demonstration(loop, 0.1))
 
 
-def test_follows_a_winding_spiral(monkeypatch):
+def test_follows_a_winding_spiral():
     """Where velocities alone teach a shortcut; a fraction of the default's effort."""
-    monkeypatch.setitem(baselines.sdsef.PLANS, "tuned", replace(baselines.sdsef.PLANS["tuned"], epochs=150))
     shown = datasets.unstable_spiral(3, 400)
     with torch.no_grad():
-        path = SDSEF(3, n_features=100, seed=0).fit(shown).rollout(shown.start, shown.times)
+        path = SDSEF(3, n_features=100, seed=0, epochs=150).fit(shown).rollout(shown.start, shown.times)
     assert float((path - shown.positions).norm(dim=-1).max()) < 0.2
     length = float(path.diff(dim=0).norm(dim=-1).sum())
     assert length == pytest.approx(float(shown.positions.diff(dim=0).norm(dim=-1).sum()), rel=0.03)

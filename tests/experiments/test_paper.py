@@ -9,12 +9,15 @@ import torch
 import typer
 from typer.testing import CliRunner
 
-from baselines import FDM, sdsef
-from experiments import claims, paper, sections, study, tuning
-from experiments.spirals import Setting
-from experiments.tuning import Choice, Grid, Tried, choose
-from latentds import ChebyshevDS, benchmark, datasets
-from latentds.benchmark import Protocol
+from experiments.methods import GREEDY, RIVALS, greedy
+from experiments.paper import latent_space, tuning, verdicts
+from experiments.paper.__main__ import main, reproduce
+from experiments.paper.held_out import HeldOut
+from experiments.paper.plan import Plan
+from experiments.paper.tuning import Choice, Grid, Tried, choose
+from experiments.paper.variants import Variant
+from experiments.published import Setting
+from latentds import benchmark, datasets
 from latentds.fitting.embedding import chebyshev_eigenvalues
 
 SMALL = Grid(betas=(0.3, 0.9), mus=(0.6, 0.9), n_layers=(5, 10, 75), n_more=1)
@@ -29,11 +32,11 @@ def test_the_rule_takes_the_fewest_layers_then_the_least_beta_or_the_least_mse()
     assert choose([bad, bad._replace(mse=2e-5, normalised=2e-5)]) == Choice(bad, bad, False)
 
 
-@pytest.mark.parametrize(("method", "kind"), [("Chebyshev", ChebyshevDS), ("FDM", FDM)])
-def test_a_match_begins_with_every_shorter_one(method, kind):
+@pytest.mark.parametrize("method", RIVALS)
+def test_a_match_begins_with_every_shorter_one(method):
     shown = datasets.unstable_spiral(3, 200)
     for count, error in zip((7, 20), tuning.trace(method, shown, 0.5, 0.8, (7, 20)), strict=True):
-        fitted = kind(3, n_layers=count, beta=0.5, mu=0.8, pinned=False).fit(shown)
+        fitted = GREEDY[method](3, n_layers=count, beta=0.5, mu=0.8, pinned=False).fit(shown)
         assert error == pytest.approx(fitted.fit_report.mse, rel=1e-6)
 
 
@@ -51,7 +54,7 @@ def test_tuning_tries_the_whole_grid_once_and_is_kept(tmp_path, monkeypatch):
 
 def test_sdsef_is_judged_where_it_was_not_trained(monkeypatch):
     shown = datasets.unstable_spiral(1, 100)
-    ds = tuning.HeldOut(3, n_layers=2, n_features=8, epochs=2)
+    ds = HeldOut(3, n_layers=2, n_features=8, epochs=2)
     trained = []
     learn = ds.learner.fit
     monkeypatch.setattr(ds.learner, "fit", lambda d, progress: (trained.append(d), learn(d))[1])
@@ -65,67 +68,80 @@ def test_sdsef_is_judged_where_it_was_not_trained(monkeypatch):
 
 @pytest.mark.parametrize("n", [2, 3, 5])
 def test_the_explicit_laplacian_has_the_eigenvalues_of_the_blocks(n):
-    values = np.linalg.eigvalsh(claims.laplacian(20, n))
+    values = np.linalg.eigvalsh(latent_space.laplacian(20, n))
     for eigenvalue in chebyshev_eigenvalues(20, n):
         assert np.abs(values - eigenvalue).min() < 1e-12
-    assert claims.laplacian(20, n).sum() == 0
+    assert latent_space.laplacian(20, n).sum() == 0
 
 
 def test_slope_is_the_exponent():
     counts = np.array([10, 100, 1000])
     frame = pd.DataFrame({"n": 3, "N": counts, "entry": 7.0 / counts**2})
-    assert claims.slope(frame, 3, "entry") == pytest.approx(-2)
+    assert latent_space.slope(frame, 3, "entry") == pytest.approx(-2)
 
 
 def test_repeated_eigenvalues_for_even_and_odd_n():
-    found = claims.spectrum((2, 3), 20)
+    found = latent_space.spectrum((2, 3), 20)
     assert list(found["of the n smallest"]) == [2, 2]
     assert list(found["distinct"]) == [20, 20]
 
 
-@pytest.mark.parametrize("method", ["Chebyshev", "FDM"])
+@pytest.mark.parametrize("method", RIVALS)
 def test_variants_differ_from_the_method_in_one_thing(method):
-    shown = datasets.unstable_spiral(1, 200)
-    setting = Setting(0.5, 0.9, 40)
-    plain = claims.KINDS[method](3, n_layers=40, beta=0.5, mu=0.9).fit(shown)
+    shown, setting = datasets.unstable_spiral(1, 200), Setting(0.5, 0.9, 40)
+    plain, bare = (greedy(method, setting, pinned=pinned)(3).fit(shown) for pinned in (True, False))
     times = shown.times
     same, decoupled, off = (
-        claims.Variant(3, claims.KINDS[method], setting, kappa, attractor).fit(shown)
-        for kappa, attractor in ((None, claims.PINNED), (5.0, claims.PINNED), (None, claims.PRINTED))
+        Variant(greedy(method, setting, pinned=not printed)(3), contraction=kappa, printed=printed).fit(shown)
+        for kappa, printed in ((None, False), (5.0, False), (None, True))
     )
     path = plain.rollout(shown.start, times)
     torch.testing.assert_close(same.rollout(shown.start, times), path)
     torch.testing.assert_close(decoupled.rollout(shown.start, times), path)  # which is on the axis
     aside = shown.start + 0.1
     assert (decoupled.rollout(aside, times) - plain.rollout(aside, times)).abs().max() > 1e-3
-    bare = claims.KINDS[method](3, n_layers=40, beta=0.5, mu=0.9, pinned=False).fit(shown)
     torch.testing.assert_close(off.attractor, bare.decode(shown.goal))
     assert (off.attractor - shown.goal).norm() > 1e-9
     torch.testing.assert_close(off.rollout(shown.start, 20 * times)[-1], off.attractor, atol=1e-6, rtol=0)
 
 
-@pytest.fixture
-def tiny(monkeypatch):
-    plan = study.Plan(
-        spirals=("unstable c=7", "stable c=3"), sensitive=("stable c=3",), grid=SMALL, official=(2, 8), tuned=(2, 8),
-        printed=False, patience=2, layers=(2,), features=(8,), epochs=2, strokes=("hook",), lasa=(), arms=1,
-    )  # fmt: skip
-    monkeypatch.setattr(paper, "QUICK", plan)
-    for module in (study, sections):
-        monkeypatch.setattr(module, "Protocol", lambda radius=0.1: Protocol(3, radius, 40))
-    monkeypatch.setattr(tuning, "ONE_START", Protocol(0, n_points=40))
-    monkeypatch.setitem(sdsef.PLANS, "tuned", replace(sdsef.PLANS["tuned"], epochs=16))
+@pytest.mark.parametrize(
+    ("ratios", "verdict"),
+    [((1.0,), "reproduced"), ((0.4, 2.9), "reproduced"), ((0.1, 2.9), "better"), ((0.1, 3.1), "worse")],
+)
+def test_figures_within_a_factor_are_reproduced(ratios, verdict):
+    assert verdicts.similar(*ratios) == verdict
 
 
-def command(*arguments):
-    app = typer.Typer()
-    app.command()(paper.main)
-    return CliRunner().invoke(app, ["--quick", "--jobs", "1", *map(str, arguments)], catch_exceptions=False)
+def test_the_summary_counts_what_the_lines_say():
+    names = [f"unstable c={c}" for c in (1, 3, 7, 15)]
+    lines = pd.DataFrame({"spiral": names, "nearer": [True, True, True, False], "lower": [*["Chebyshev"] * 3, "FDM"]})
+    lines = lines.assign(fast=[0.04, 0.06, 0.01, 0.01], best=["SDS-EF", "FDM", "Chebyshev", "FDM"])
+    nearer, best = verdicts.similarity(lines)
+    assert nearer[2:] == ("nearer on 3 of 4 spirals, with p < .05 on 2", "reproduced")
+    assert best[2].startswith("SDS-EF (either recipe) first on 1 of 1 with c ≤ 2, Chebyshev on 1 of 2")
+    assert best.verdict == "reproduced in part"
+    layers = pd.DataFrame(
+        {"Chebyshev": [50, 75], "FDM": [50, 100], "a layer": 7, "SDS-EF": 400, "SDS-EF official": 900}
+    )
+    found = verdicts.parameters(layers)
+    assert (
+        "fewer layers than FDM on 1, as many on 1, more on 0 spirals; fewer parameters than SDS-EF on 1 of 2"
+        in found.ours
+    )
+    assert found.verdict == "reproduced"
 
 
-def test_the_command_writes_a_report_and_goes_on_where_it_stopped(tiny, tmp_path, monkeypatch):
-    arguments = ("--out", tmp_path, "--doc", tmp_path / "docs" / "reproduction.md")
-    assert command(*arguments).exit_code == 0
+TINY = Plan(
+    spirals=("unstable c=7", "stable c=3"), sensitive=("stable c=3",), grid=SMALL, official=(2, 8), tuned=(2, 8),
+    printed=False, official_epochs=2, tuned_epochs=16, layers=(2,), features=(8,), epochs=2, strokes=("hook",),
+    lasa=(), arms=1, n_starts=3, n_points=40, quick=True,
+)  # fmt: skip
+
+
+@pytest.mark.slow
+def test_a_run_writes_a_report_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    reproduce(TINY, tmp_path, tmp_path / "docs" / "reproduction.md", 1)
     written = (tmp_path / "docs" / "reproduction.md").read_text()
     assert "A quick run" in written
     summary = written.split("## Summary")[1].split("##")[0]
@@ -140,12 +156,15 @@ def test_the_command_writes_a_report_and_goes_on_where_it_stopped(tiny, tmp_path
         raise AssertionError("computed anew")
 
     monkeypatch.setattr(benchmark, "evaluate", again)
-    assert command(*arguments).exit_code == 0
+    reproduce(TINY, tmp_path, tmp_path / "docs" / "reproduction.md", 1)
+    told = (tmp_path / "docs" / "reproduction.md").read_text()
+    assert told.split("## Summary")[1] == written.split("## Summary")[1]
 
 
-def test_recordings_come_from_a_folder(tmp_path):
-    datasets.joint_motion(0, 50).save(tmp_path / "b.npz")
-    datasets.joint_motion(1, 50).save(tmp_path / "a.csv")
-    assert [shown.dim for shown in sections.recordings(tmp_path)] == [7, 7]
-    with pytest.raises(ValueError, match="data: expected a folder"):
-        sections.recordings(tmp_path / "nothing")
+def test_recordings_that_are_none_are_refused_before_any_work(tmp_path):
+    app = typer.Typer()
+    app.command()(main)
+    result = CliRunner().invoke(app, ["--out", str(tmp_path), "--data", str(tmp_path / "nothing")])
+    assert result.exit_code == 2
+    assert "data: expected .npz or .csv files" in " ".join(result.output.split())
+    assert not list(tmp_path.iterdir())

@@ -104,6 +104,7 @@ def command(*arguments):
     return CliRunner().invoke(app, ["--quick", "--jobs", "1", *map(str, arguments)])
 
 
+@pytest.mark.slow
 def test_the_command_leaves_rows_summary_settings_and_pictures(small, tmp_path):
     result = command("--out", tmp_path / "new")
     assert result.exit_code == 0, result.output
@@ -114,7 +115,7 @@ def test_the_command_leaves_rows_summary_settings_and_pictures(small, tmp_path):
     assert len(rows) == 3 * 2 * 21
     assert "unstable c=7" in result.output
     settings = json.loads((tmp_path / "new" / "settings.json").read_text())
-    assert settings["Chebyshev"]["unstable c=7"]["n_layers"] == 175
+    assert settings["methods"]["unstable c=7"]["Chebyshev"]["n_layers"] == 8
     assert settings["environment"]["packages"]["torch"]
     assert settings["protocol"] == {"n_starts": 20, "radius": 0.1, "n_points": 500}
 

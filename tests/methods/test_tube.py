@@ -405,6 +405,19 @@ def test_rollout_error_is_the_distance_of_the_rollout(n_layers):
     assert ds.fit_report.rollout_error > 1e-7
 
 
+@pytest.mark.parametrize(("homotopy", "isotopy"), [("linear", "straight"), ("curvature", "unbending")])
+def test_one_homotopy_alone(homotopy, isotopy):
+    ds = TubeDS(2, n_layers=20, refined=False, homotopy=homotopy).fit(motion(lambda t: t))
+    assert ds.fit_report.isotopy == isotopy
+    assert ds.settings["homotopy"] == homotopy
+
+
+@pytest.mark.parametrize(("dim", "homotopy"), [(2, "straight"), (2, None), (1, "curvature")])
+def test_another_homotopy_is_refused(dim, homotopy):
+    with pytest.raises(ValueError, match=r"^homotopy: expected one of \('linear'"):
+        TubeDS(dim, homotopy=homotopy)
+
+
 def test_refinement_pays():
     shown = datasets.unstable_spiral(7, 300)
     plain, better = (TubeDS(3, n_layers=60, refined=refined).fit(shown) for refined in (False, True))

@@ -1,0 +1,30 @@
+"""Motions by name and from files."""
+
+from __future__ import annotations
+
+import pytest
+
+from experiments import motions
+from latentds import Demonstration, datasets
+from latentds.testing import wavy_motion
+
+
+def test_spirals_have_names_that_lead_back_to_them():
+    for shown in motions.spirals(quick=True):
+        assert (motions.spiral(shown.name).positions == shown.positions).all()
+    assert [d.name for d in motions.spirals(quick=False)] == [d.name for d in datasets.spiral_suite(3)]
+
+
+def test_recordings_are_read_from_files_and_folders(tmp_path):
+    assert motions.recordings([]) == []
+    for name, ending in (("two", "npz"), ("one", "csv")):
+        shown = wavy_motion(2)
+        Demonstration(shown.positions, shown.dt, name).save(tmp_path / f"{name}.{ending}")
+    assert [shown.name for shown in motions.recordings([tmp_path])] == ["one", "two"]
+    assert [shown.name for shown in motions.recordings([tmp_path / "two.npz"])] == ["two"]
+    with pytest.raises(ValueError, match="data: expected recordings of different names"):
+        motions.recordings([tmp_path, tmp_path / "one.csv"])
+    with pytest.raises(ValueError, match=r"data: expected \.npz or \.csv files, found none in .*nothing"):
+        motions.recordings([tmp_path / "nothing"])
+    with pytest.raises(FileNotFoundError):
+        motions.recordings([tmp_path / "nothing.npz"])
