@@ -212,6 +212,7 @@ def test_converged_wants_the_goal_in_time(method):
     assert not compare({"m": method}, SPIRAL, **QUICK)["converged"].any()
 
 
+@pytest.mark.slow
 def test_processes_and_threads_give_the_serial_rows():
     methods = {**SMALL, "random": Straight, "lambda": lambda dim: Straight(dim)}
     settings = {"n_starts": 2, "n_points": 50, "seeds": (0, 1)}

@@ -43,6 +43,7 @@ SHOWN = [datasets.unstable_spiral(c, 60) for c in (1, 3)]
 SEEDS = range(5)
 
 
+@pytest.mark.slow
 def test_rows_equal_the_serial_runs_although_a_worker_was_killed(scheduler):
     import pandas as pd
 
@@ -64,6 +65,7 @@ def test_rows_equal_the_serial_runs_although_a_worker_was_killed(scheduler):
     assert frames[0].reset_index(drop=True).equals(frames[1].reset_index(drop=True))
 
 
+@pytest.mark.slow
 def test_compare_and_its_store_need_no_change(scheduler, tmp_path):
     settings = {"n_starts": 1, "n_points": 30, "store": tmp_path / "cells.sqlite"}
     with distributed.Client(scheduler), joblib.parallel_config(backend="dask"):

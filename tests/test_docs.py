@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 import re
 from pathlib import Path
 
@@ -34,3 +35,25 @@ def test_links_lead_somewhere():
         for target in re.findall(r"\]\(([^)#]+?)\)", page.read_text(encoding="utf-8")):
             if "://" not in target:
                 assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_named_files_and_modules_exist():
+    for page in [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]:
+        text = page.read_text(encoding="utf-8")
+        for path in re.findall(r"\b(?:latentds|baselines|experiments|tests)/[\w/]+\.py\b", text):
+            assert (ROOT / path).is_file(), f"{page.name}: {path}"
+        for name in re.findall(r"`((?:latentds|baselines|experiments)(?:\.\w+)+)\b", text):
+            assert resolves(name), f"{page.name}: {name}"
+
+
+def resolves(name):
+    """Whether a dotted name is a module of ours, or something in one."""
+    try:
+        return pkgutil.resolve_name(name) is not None
+    except (ImportError, AttributeError):
+        return False
+
+
+def test_names_that_lead_nowhere_are_seen():
+    assert resolves("latentds.testing.check_stable_ds")
+    assert not resolves("latentds.kernels.serves")

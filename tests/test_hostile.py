@@ -18,6 +18,7 @@ from latentds import ChebyshevDS, TubeDS, datasets
 from latentds.testing import wavy_motion
 
 
+@pytest.mark.slow
 @seeded(7)
 @settings(
     max_examples=25, deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck)
@@ -178,6 +179,7 @@ def _in_another_process(ds, y, queue):
         queue.put((ds(y).numpy(), ds.rollout(y, torch.linspace(0, 1, 5)).numpy(), refitted(y).numpy()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["fork", "spawn"])
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of fork in a threaded process: that is the test
 def test_other_processes_give_the_same_result(how, draw):

@@ -116,11 +116,13 @@ def test_bad_input_is_named():
         plotting.dtw_bars(pd.DataFrame())
 
 
+@pytest.mark.slow
 def test_the_backend_is_left_alone():
     code = "import sys, latentds.plotting; assert 'matplotlib.pyplot' not in sys.modules"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
+@pytest.mark.slow
 def test_the_library_needs_none_of_the_studies_packages():
     hide = "import sys; sys.modules.update(dict.fromkeys(['matplotlib', 'pandas', 'joblib', 'rich']));"
     code = f"""{hide}

@@ -341,6 +341,7 @@ for thing in (SDSEF(3, n_layers=2, n_features=10), {"b", "a", "c"}, Mine(3), lam
 """
 
 
+@pytest.mark.slow
 def test_fingerprints_do_not_depend_on_the_process():
     found = {
         subprocess.run(
@@ -407,11 +408,13 @@ def test_a_damaged_store_gives_what_it_got_or_one_clear_error(file, tmp_path):
         assert [cells.get(key) for key in kept]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
 def test_killed_runs_lose_nothing():
     kill.main(kills=3, seed=1, n_seeds=8)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs process groups")
 def test_ctrl_c_ends_with_what_is_done(file):
     code = f"""

@@ -156,6 +156,7 @@ print([part.grad.numpy().tobytes().hex() for part in amplitudes])
 """
 
 
+@pytest.mark.slow
 def test_kernels_just_compiled_and_kernels_from_disk_round_alike(tmp_path):
     """A fit is repeated to the bit in the next process, too."""
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}

@@ -107,6 +107,7 @@ def test_a_cell_that_fails_says_so(tmp_path):
     assert np.isnan(rows[0]["share"])
 
 
+@pytest.mark.slow
 def test_a_rerun_goes_on_where_it_stopped(tmp_path):
     shown = Demonstration(wavy_motion(2).positions, 0.01, "shown")
     few, more = (ablation.cell(f"TubeDS {n}", tube(n), shown) for n in (10, 20))

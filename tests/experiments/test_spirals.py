@@ -120,6 +120,7 @@ def test_the_command_leaves_rows_summary_settings_and_pictures(small, tmp_path):
     assert settings["protocol"] == {"n_starts": 20, "radius": 0.1, "n_points": 500}
 
 
+@pytest.mark.slow
 def test_an_interrupted_command_tells_what_is_done(small, tmp_path, monkeypatch):
     def stopped(*arguments, **settings):
         yield from itertools.islice(benchmark.run(*arguments, **settings), 1)

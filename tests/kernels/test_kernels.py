@@ -366,6 +366,7 @@ def test_compiling_where_no_cache_can_be_kept(monkeypatch, capsys):
     assert capsys.readouterr().err == "latentds: compiled twice for this CPU in 5.0 s\n"
 
 
+@pytest.mark.slow
 def test_an_edit_of_what_a_kernel_inlines_compiles_it_anew(tmp_path):
     shutil.copytree(
         Path(compiling.__file__).parents[1], tmp_path / "latentds", ignore=shutil.ignore_patterns("__pycache__")

@@ -342,6 +342,7 @@ def test_mean_of_equal_ones_is_each_of_them():
 # --- units, types, report ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
 @pytest.mark.parametrize("refined", [False, True])
 def test_units_and_origin_do_not_matter(scale, refined):
@@ -418,6 +419,7 @@ def test_another_homotopy_is_refused(dim, homotopy):
         TubeDS(dim, homotopy=homotopy)
 
 
+@pytest.mark.slow
 def test_refinement_pays():
     shown = datasets.unstable_spiral(7, 300)
     plain, better = (TubeDS(3, n_layers=60, refined=refined).fit(shown) for refined in (False, True))
