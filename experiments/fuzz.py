@@ -43,6 +43,12 @@ SHAPES = (
     "loop",
     "crossing",
     "there and back",
+    "planar spiral",
+    "near circle",
+    "near Lissajous",
+    "near trefoil",
+    "helix",
+    "loop-the-loop",
 )
 FLAWS = (
     "none",
@@ -111,7 +117,33 @@ def _path(shape: str, count: int, dim: int, draw: np.random.Generator) -> NDArra
         return np.asarray(path)
     if shape == "crossing":
         return np.stack([np.sin((k + 1) * np.pi * 1.7 * t[:, 0]) for k in range(dim)], axis=1)
-    return np.asarray(np.minimum(t, 1.2 - t) * axis)  # there and back
+    if shape == "there and back":
+        return np.asarray(np.minimum(t, 1.2 - t) * axis)
+    columns = _winding(shape, t[:, 0], draw)
+    turned = np.linalg.qr(draw.normal(size=(max(dim, len(columns)), len(columns))))[0]
+    return np.asarray((turned[:dim] @ columns).T)
+
+
+def _winding(shape: str, t: NDArray[np.float64], draw: np.random.Generator) -> NDArray[np.float64]:
+    """Curves in a plane or in space, (2 or 3, N), that wind, or come back to where they began, or nearly so."""
+    near = 2 * np.pi * (1 - 10.0 ** draw.uniform(-4, -1)) * t
+    if shape == "planar spiral":
+        angle = 2 * np.pi * draw.uniform(2, 5) * t
+        return (1 - 0.95 * t) * np.stack([np.cos(angle), np.sin(angle)])
+    if shape == "near circle":
+        return np.stack([np.cos(near), np.sin(near)])
+    if shape == "near Lissajous":
+        return np.stack([np.sin(3 * near), np.sin(4 * near + 0.4), np.sin(5 * near + 1.1)])
+    if shape == "near trefoil":
+        flat = np.sin(near) + 2 * np.sin(2 * near), np.cos(near) - 2 * np.cos(2 * near)
+        return np.stack([*flat, -np.sin(3 * near)])
+    if shape == "helix":
+        angle = 2 * np.pi * draw.uniform(2, 30) * t
+        return np.stack([np.cos(angle), np.sin(angle), draw.uniform(0.5, 4) * t])
+    if shape == "loop-the-loop":
+        angle = 2 * np.pi * np.clip(3 * t - 1, 0, 1)
+        return np.stack([3 * t + np.sin(angle), 1 - np.cos(angle), draw.uniform(0.05, 0.5) * t])
+    raise ValueError(f"shape: expected one of {SHAPES}, got {shape!r}")
 
 
 def _flawed(path: NDArray[np.float64], flaw: str, draw: np.random.Generator) -> NDArray[np.float64]:
@@ -131,9 +163,13 @@ def _flawed(path: NDArray[np.float64], flaw: str, draw: np.random.Generator) -> 
         path[middle:] += 100 * draw.normal(size=path.shape[1])
     elif flaw == "near loop":
         path[-1] = path[0] + 10.0 ** draw.uniform(-15, -3) * draw.normal(size=path.shape[1])
-    elif flaw == "hopeless":
-        rows = draw.choice([0, int(draw.integers(count))])
-        path[rows:] = draw.choice([math.nan, math.inf, path[0, 0]])
+    elif flaw in ("nan", "inf"):
+        rows = draw.choice([slice(middle, middle + 1), slice(draw.integers(count), None)])
+        path[rows, draw.integers(path.shape[1])] = math.nan if flaw == "nan" else draw.choice([-math.inf, math.inf])
+    elif flaw == "equal":
+        path[draw.choice([0, count // 4]) :] = path[0]
+    elif flaw != "none":
+        raise ValueError(f"flaw: expected one of {FLAWS}, got {flaw!r}")
     return path
 
 

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import seed as seeded
 
 from baselines import FDM, SDSEF
-from experiments.fuzz import METHODS, Case, cases, outcome, summary
+from experiments.fuzz import FLAWS, METHODS, SHAPES, Case, cases, outcome, summary
 from latentds import ChebyshevDS, TubeDS, datasets
 from latentds.testing import wavy_motion
 
@@ -49,6 +49,36 @@ def test_every_form_is_taken(method, form):
 @pytest.mark.parametrize(("scale", "offset"), [(1e-9, 0.0), (1e9, 0.0), (1.0, 1e6)])
 def test_every_scale_is_taken(method, scale, offset):
     assert outcome(PLAIN._replace(method=method, scale=scale, offset=offset, dim=3)) == "stable"
+
+
+def told_apart(cases):
+    kinds = {case.positions().tobytes() for case in cases}
+    return len(kinds) == len(cases)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 7])
+def test_every_shape_and_every_flaw_is_alive(dim):
+    case = PLAIN._replace(form="numpy", dim=dim)
+    assert told_apart([case._replace(flaw=flaw) for flaw in FLAWS])
+    shapes = [case._replace(shape=shape) for shape in SHAPES]
+    assert told_apart(shapes)
+    for shape in shapes:
+        path = shape.positions()
+        assert path.shape == (100, dim)
+        assert 0.01 < np.ptp(path, axis=0).max() < 20
+    near = [shape.positions() for shape in shapes if shape.shape.startswith("near")]
+    assert all(
+        np.linalg.norm(path[-1] - path[0]) < np.linalg.norm(np.diff(path, axis=0), axis=1).sum() / 5 for path in near
+    )
+    for unknown in (case._replace(shape="square"), case._replace(flaw="hopeless")):
+        with pytest.raises(ValueError, match=r"expected one of .* got"):
+            unknown.positions()
+
+
+@pytest.mark.parametrize("flaw", ["nan", "inf"])
+@pytest.mark.parametrize("seed", range(4))
+def test_numbers_that_are_none_are_refused_by_name(flaw, seed):
+    assert outcome(PLAIN._replace(flaw=flaw, seed=seed)).startswith("ValueError: positions: expected finite numbers")
 
 
 def test_the_fuzzer_tells_a_broken_promise(monkeypatch):
