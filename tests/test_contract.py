@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 
-import baselines.sdsef
 from baselines import FDM, SDSEF
 from latentds import ChebyshevDS, Demonstration, TubeDS
 from latentds.testing import parametrize_stable_ds, wavy_motion
@@ -15,15 +12,9 @@ from latentds.testing import parametrize_stable_ds, wavy_motion
 METHODS = {
     "ChebyshevDS": lambda dim: ChebyshevDS(dim, n_layers=15),
     "FDM": lambda dim: FDM(dim, n_layers=15),
-    "SDSEF": lambda dim: SDSEF(dim, n_layers=3, n_features=20, seed=0),
+    "SDSEF": lambda dim: SDSEF(dim, n_layers=3, n_features=20, epochs=10, seed=0),
     "TubeDS": lambda dim: TubeDS(dim, n_layers=15, refined=False),
 }
-
-
-@pytest.fixture(autouse=True)
-def _short_training(monkeypatch):
-    plan = baselines.sdsef.PLANS["tuned"]
-    monkeypatch.setitem(baselines.sdsef.PLANS, "tuned", replace(plan, epochs=10))
 
 
 @parametrize_stable_ds(METHODS, dims=[1, 2, 3, 7])
