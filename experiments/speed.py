@@ -209,7 +209,9 @@ def fits(rounds: int) -> list[Goal]:
     note = f"MSE {error:.3g} against {theirs:.3g}"
     return [
         race("fit, M = 300, N = 1000, bounded scalar search", 30, slow, fast, few(rounds)),
-        goals.at_most("fit, MSE over that of the bounded search", pd.Series([error / theirs]), 1)._replace(note=note),
+        goals.at_most("fit, MSE over that of the bounded search", pd.Series([error / theirs]), 1)._replace(
+            unit="ratio", note=note
+        ),
     ]
 
 
