@@ -206,6 +206,7 @@ def test_counterexample_of_the_bound_is_where_space_folds():
     assert np.isfinite(line.counterexample).all()
 
 
+@pytest.mark.slow
 def test_floats_can_falsify_what_the_proof_promises():
     """Couplings are invertible whatever their parameters, on paper; here exp overflows what a float holds."""
     ds = SDSEF(2, n_layers=4, n_features=10, seed=0)
