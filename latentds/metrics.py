@@ -10,7 +10,6 @@ import math
 from typing import Any
 
 import numpy as np
-import torch
 from fastdtw import fastdtw
 from numpy.typing import NDArray
 
@@ -118,22 +117,6 @@ def velocity_cosine(velocities: Any, reference: Any) -> float:
         return NAN
     along = np.einsum("ij,ij->i", a / np.where(speeds > 0, speeds, 1)[:, None], b)[moving]
     return float((along / shown[moving]).mean())
-
-
-def path_condition(jacobians: Any) -> float:
-    """Largest condition number (spectral) of the Jacobians of a map along a path, (..., n, n).
-
-    How far the map is from an isometry: 1 for one; inf where it flattens space, or holds NaN or inf.
-
-    Raises:
-        ValueError: if the argument is no such array.
-    """
-    matrices = real_array(jacobians, "jacobians")
-    if matrices.ndim < 2 or matrices.shape[-1] != matrices.shape[-2] or matrices.size == 0:
-        raise ValueError(f"jacobians: expected shape (..., n, n) with n >= 1, got {matrices.shape}")
-    if not np.isfinite(matrices).all():
-        return math.inf
-    return float(torch.linalg.cond(torch.from_numpy(matrices)).nan_to_num(nan=math.inf).max())
 
 
 def _pair(path: Any, reference: Any, *, same_length: bool = False) -> tuple[Array, Array]:
