@@ -164,10 +164,8 @@ def _flawed(path: NDArray[np.float64], flaw: str, draw: np.random.Generator) -> 
     elif flaw == "near loop":
         path[-1] = path[0] + 10.0 ** draw.uniform(-15, -3) * draw.normal(size=path.shape[1])
     elif flaw in ("nan", "inf"):
-        first = int(draw.choice([middle, int(draw.integers(count))]))
-        path[first : draw.choice([first + 1, count]), draw.integers(path.shape[1])] = (
-            math.nan if flaw == "nan" else draw.choice([-math.inf, math.inf])
-        )
+        number = math.nan if flaw == "nan" else draw.choice([-math.inf, math.inf])
+        path[middle : draw.choice([middle + 1, count]), draw.integers(path.shape[1])] = number
     elif flaw == "equal":
         path[draw.choice([0, count // 4]) :] = path[0]
     elif flaw != "none":

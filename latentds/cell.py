@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -143,8 +145,36 @@ class Outcome:
     paths: NDArray[np.float64]
 
 
+@contextmanager
+def interrupts_kept() -> Iterator[None]:
+    """Ctrl-C in this block ends it with KeyboardInterrupt, whatever became of it there.
+
+    What is raised while compiled code calls back into Python is dropped or comes out as another error: an interrupt
+    while numba loads or compiles a kernel as "RuntimeError: no compiled object yet", or not at all.
+    """
+    usual = signal.default_int_handler
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not usual:
+        yield  # Ctrl-C is heard elsewhere
+        return
+    pressed = False
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        nonlocal pressed
+        pressed = True
+        usual(number, frame)
+
+    signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual)
+        if pressed:
+            raise KeyboardInterrupt
+
+
+@interrupts_kept()
 def evaluate(cell: Cell, protocol: Protocol) -> Outcome:
-    """Fit, roll out and score one cell. Whatever the method raises is told in its rows."""
+    """Fit, roll out and score one cell. Whatever the method raises is told in its rows; Ctrl-C is no failure of it."""
     shown, judges, share = cell.shown, cell.judges, protocol.n_starts + 1
     paths = np.full((len(judges), share, protocol.n_points, shown[0].dim), np.nan)
     converged = np.zeros((len(judges), share), dtype=bool)

@@ -184,7 +184,7 @@ class _Reading:
 
     def _children(self, thing: Any) -> list[Any]:
         if isinstance(thing, CodeType):
-            return [getattr(thing, name, None) for name in _CODE]
+            return [_bytecode(thing)]
         if isinstance(thing, CellType):
             try:
                 return [thing.cell_contents]
@@ -265,6 +265,14 @@ class _Reading:
         return bool(folders) or (name or "").partition(".")[0] in sys.stdlib_module_names
 
 
+@cache
+def _bytecode(code: CodeType) -> bytes:
+    reading = _Reading()
+    reading.add([getattr(code, name, None) for name in _CODE], ())
+    return reading.digest.digest()
+
+
+@cache
 def _globals(code: CodeType) -> set[str]:
     """Names that a function, and those nested in it, look up in their module."""
     inner = [_globals(part) for part in code.co_consts if isinstance(part, CodeType)]
