@@ -503,7 +503,8 @@ except KeyboardInterrupt: print("interrupted")"""
     began = time.monotonic()
     out, err = child.communicate(timeout=60)
     assert out == b"interrupted\n", err
-    assert b"Traceback" not in err
+    idle = err.count(b"Process LokyProcess")  # joblib's own workers between two cells may tell where they were hit
+    assert err.count(b"Traceback") == idle, err
     assert time.monotonic() - began < 30
     with CellStore(file) as store:
         assert 3 < len(store) < len(kill.cells(60))
