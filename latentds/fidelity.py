@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from .arguments import number_in, point_array, positive
 from .demonstration import Demonstration, jitter
 from .metrics import dtw, endpoint_error, path_length, path_length_ratio
 
@@ -27,8 +28,8 @@ NEAR, NEARBY_MISS = 0.01, 0.15
 """A start so near the demonstrated one, in sizes, that nobody places it better, may miss by thrice ``MISS``: a tight
 spiral spreads good fits that far, a motion that jumps to another strand or to the goal misses by twice as much."""
 BESIDE, FASTEST = 0.1, 20.0
-"""Within so many sizes of the path no velocity exceeds the largest demonstrated one so many times. A tube's pull, which
-brings back what is so far off in a twentieth of the duration, is a few times it; a map near a fold makes it hundreds."""
+"""Within so many sizes of the path no velocity exceeds the largest demonstrated one so many times. The pull of a tube
+that brings back what is so far off in a twentieth of the duration is a few times it; near a fold it is hundreds."""
 ROUNDING = 1e-3
 """Share of itself by which V may rise along a motion, and of the size by which a motion may differ from its two halves:
 a sound system keeps both to rounding, or to the tolerance of its integrator."""
@@ -56,12 +57,21 @@ class Excerpt:
         duration: seconds.
         fastest: largest demonstrated speed, units per second.
         ruler: length below which a step counts as noise, in the units of the positions.
+
+    Raises:
+        ValueError: naming the attribute, if one is none of this.
     """
 
     path: tuple[tuple[float, ...], ...]
     duration: float
     fastest: float
     ruler: float
+
+    def __post_init__(self) -> None:
+        point_array(self.path, "path")
+        positive(self.duration, "duration")
+        positive(self.fastest, "fastest")
+        number_in(self.ruler, "ruler", 0, math.inf, ends="[)")
 
     @classmethod
     def of(cls, shown: Demonstration) -> Excerpt:
