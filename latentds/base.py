@@ -124,6 +124,10 @@ class StableDS(nn.Module, ABC):
         """The velocity field as plain arrays, for controllers and exporters; None where it cannot be written so."""
         return None
 
+    def latent_error(self, y0: Tensor, t: Tensor) -> Tensor | None:
+        """What rounding does to the map of a latent system, see :class:`LatentDS`; None for any other."""
+        return None
+
     @property
     def settings(self) -> dict[str, Any]:
         """The constructor's arguments; each is an attribute of the same name, as it is in scikit-learn."""
@@ -266,6 +270,20 @@ class LatentDS(StableDS):
         finite = torch.isfinite(jacobians).all(-1).all(-1)
         safe = torch.where(finite[..., None, None], jacobians, torch.eye(self.dim).to(jacobians))
         return torch.where(finite, torch.linalg.cond(safe), math.inf)
+
+    def latent_error(self, y0: Tensor, t: Tensor) -> Tensor:
+        """How far encode(decode(x)) comes back from x along the latent motion from ``y0``, in the length of its way.
+
+        Invertible on paper is not invertible in floats: where ψ nearly folds, rounding ψ(x) loses x.
+
+        Returns:
+            (..., n), (T,) seconds -> (..., T).
+        """
+        begun = self.encode(y0)
+        x = self.dynamics.flow(begun, self._times(t))
+        way = torch.linalg.vector_norm(begun - self.dynamics.attractor, dim=-1, keepdim=True)
+        error: Tensor = torch.linalg.vector_norm(self.encode(self.decode(x)) - x, dim=-1) / way
+        return error
 
     def tables(self) -> FieldTables | None:
         # A subclass whose velocity is another one must say itself how to write it.

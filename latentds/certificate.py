@@ -13,7 +13,7 @@ from torch import Tensor
 
 from .arguments import real_array, whole_number
 from .base import FitReport, LatentDS, StableDS
-from .fidelity import STARTS, Excerpt, measure
+from .fidelity import ROUNDING, STARTS, Excerpt, measure
 
 Verdict = Literal["proven", "not falsified", "falsified"]
 
@@ -21,8 +21,6 @@ HORIZON = 100.0
 """Durations within which every motion must arrive: far beyond what any pause or far start of a sound fit costs."""
 N_TIMES = 101
 """Times of one duration at which motions are looked at."""
-HALVES = 1e-4
-"""Share of the region's size by which a motion may differ from its two halves: what integrators' tolerances leave."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +127,7 @@ class _Search:
         self.goal = ds.attractor.detach()
         self.size = float((box[1] - box[0]).max())
         self.tolerance = torch.finfo(self.goal.dtype).eps ** 0.4  # 5e-7 in float64
+        self.rounding = max(ROUNDING, self.tolerance)
         inside = box[0] + (box[1] - box[0]) * self._uniform(n_samples - n_samples // 4, ds.dim)
         radii = self.size * 10 ** (-3 * self._uniform(n_samples // 4, 1))
         near = self.goal.cpu() + radii * self._directions(n_samples // 4)
@@ -145,7 +144,7 @@ class _Search:
         self.strange = len(kept) - len(self.shown)
         self.duration = self.shown[0].duration if self.shown else self.size / self.speed
         demonstrated = torch.tensor([one.path[0] for one in self.shown], dtype=torch.float64).reshape(-1, ds.dim)
-        some = self.points[:: max(1, len(self.points) // 64)]
+        some = self.points[:: max(1, len(self.points) // 32)]
         self.starts = torch.cat([demonstrated.to(self.points), some])
         self.times = torch.linspace(0, self.duration, N_TIMES, dtype=torch.float64).to(self.points.device)
 
@@ -176,10 +175,9 @@ class _Search:
         """
         claim, goal = "latent motions approach the goal, -V̇/2V >= rate > 0", ds.dynamics.attractor
         with torch.no_grad():
-            x = ds.encode(self.points)
+            x = torch.cat([ds.encode(self.points), ds.dynamics.flow(ds.encode(self.starts), self.times).flatten(0, 1)])
             reach = torch.linalg.vector_norm(x - goal, dim=-1)
-            kept = torch.isfinite(reach) & (reach > 0)
-            x, points = x[kept], self.points[kept]
+            x = x[torch.isfinite(reach) & (reach > 0)]
             box, where = ds.diffeomorphism.inverse_box(self.box[0], self.box[1]), "in the region"
             if box is None:
                 farthest, where = x - goal, "where samples lie"
@@ -189,8 +187,8 @@ class _Search:
             bound = ds.dynamics.convergence_rate_bound(radius)
             if bound is not None and 0 < bound < math.inf:
                 return Line(claim, "proven", 1, bound, f"least rate {where}, per second:")
-            offset = x - goal
-            rates = -(ds.dynamics(x, ds.decode(x)) * offset).sum(-1) / offset.square().sum(-1)
+            offset, points = x - goal, ds.decode(x)
+            rates = -(ds.dynamics(x, points) * offset).sum(-1) / offset.square().sum(-1)
         rates = rates.nan_to_num(nan=-math.inf)
         worst = int(rates.argmin())
         holds = bool(rates[worst] > 0)
@@ -216,12 +214,12 @@ class _Search:
             y = ds.decode(x)
             points = torch.cat([self.points, y])
             there = torch.linalg.vector_norm(ds.decode(ds.encode(points)) - points, dim=-1) / self.size
-            # The longest latent motion is the unit: of those from the demonstrations, if there are any.
-            unit = torch.linalg.vector_norm(begun - ds.dynamics.attractor, dim=-1)[: len(self.shown) or None].max()
-            back = torch.linalg.vector_norm(ds.encode(y) - x, dim=-1) / unit
+            # In the longest way to the goal: of a demonstration, if there is one.
+            way = torch.linalg.vector_norm(begun - ds.dynamics.attractor, dim=-1, keepdim=True)
+            back = ds.latent_error(self.starts, self.times) * way / way[: len(self.shown) or None].max()
         return [
             self._judge("decode inverts encode", there, self.tolerance, "relative error", points),
-            self._judge("encode inverts decode", back, self.tolerance, "error in latent lengths", y),
+            self._judge("encode inverts decode", back.flatten(), self.rounding, "error in latent lengths", y),
             self._jacobian(ds),
             self._conditioning(ds, torch.cat([ds.encode(self.points).detach(), x]), points),
         ]
@@ -303,10 +301,9 @@ class _Search:
             anew = self.ds.rollout(paths[:, middle], self.times[middle:])
             apart = torch.linalg.vector_norm(anew - paths[:, middle:], dim=-1).amax(-1) / self.size
         before = paths[:, :-1].flatten(0, 1)
-        limit = max(HALVES, self.tolerance)
         return [
             self._judge("V falls along motions", rise.flatten(), self.tolerance, "largest rise over V(0)", before),
-            self._judge("a motion is its two halves", apart, limit, "largest distance", self.starts),
+            self._judge("a motion is its two halves", apart, self.rounding, "largest distance", self.starts),
         ]
 
     def _descent(self) -> Line:

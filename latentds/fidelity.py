@@ -31,8 +31,8 @@ BESIDE, FASTEST = 0.1, 20.0
 """Within so many sizes of the path no velocity exceeds the largest demonstrated one so many times. The pull of a tube
 that brings back what is so far off in a twentieth of the duration is a few times it; near a fold it is hundreds."""
 ROUNDING = 1e-3
-"""Share of itself by which V may rise along a motion, and of the size by which a motion may differ from its two halves:
-a sound system keeps both to rounding, or to the tolerance of its integrator."""
+"""What rounding may do along a motion: let V rise by so much of itself, carry it so many sizes away when it is begun
+anew half-way, bring encode(decode(x)) so many latent lengths off x. Sound systems stay orders of magnitude below."""
 
 STARTS = 8
 """Motions from nearby starts."""
@@ -101,6 +101,8 @@ class System(Protocol):
 
     def rollout(self, y0: Tensor, t: Tensor) -> Tensor: ...
 
+    def latent_error(self, y0: Tensor, t: Tensor) -> Tensor | None: ...
+
 
 @dataclass(frozen=True)
 class Fidelity:
@@ -116,7 +118,8 @@ class Fidelity:
             a quarter of the way to where the demonstration comes back to it.
         fastest: largest velocity on the demonstrated path and within ``BESIDE`` sizes of it, over the largest shown.
         rise: largest rise of V along the motion, over V at its start.
-        halves: largest distance of the motion and the same one in two halves, in sizes.
+        halves: largest distance of the motion from the same one begun anew half-way, in sizes.
+        latent_error: see :meth:`~latentds.LatentDS.latent_error`; 0 for a system without latent space.
         spread: of several demonstrations, how far they miss each other: as ``miss``, each and the next. Nobody can
             follow all of them more closely, so it is added to what ``miss``, ``end`` and ``nearby`` may be.
         shown: what it was held against.
@@ -129,6 +132,7 @@ class Fidelity:
     fastest: float
     rise: float
     halves: float
+    latent_error: float = 0.0
     spread: float = 0.0
     shown: tuple[Excerpt, ...] = field(default=(), repr=False)
 
@@ -162,10 +166,11 @@ class Fidelity:
                 self.fastest / FASTEST,
                 f"moves {self.fastest:.3g} times as fast as shown within {BESIDE:.0%} of the size from the path",
             ),
-            (self.rise / ROUNDING, f"V rises by {self.rise:.3g} of itself along the motion: rounding broke the map"),
+            (self.rise / ROUNDING, f"V rises by {self.rise:.3g} of itself along its motion"),
+            (self.halves / ROUNDING, f"its motion begun anew half-way is another one, {self.halves:.3g} sizes away"),
             (
-                self.halves / ROUNDING,
-                f"the motion in two halves is another one, {self.halves:.3g} of the size away: rounding broke the map",
+                self.latent_error / ROUNDING,
+                f"rounding breaks its map, encode(decode(x)) is {self.latent_error:.3g} latent lengths from x",
             ),
         )
         return tuple((math.inf if math.isnan(badness) else badness, told) for badness, told in found)
@@ -212,7 +217,7 @@ def _measure(ds: System, one: Excerpt, path: Array, around: Array, ball: Array) 
     if moved.shape != (len(starts), *path.shape):
         raise ValueError(f"rollout: expected shape {(len(starts), *path.shape)}, got {tuple(moved.shape)}")
     motions = moved.double().cpu().numpy()
-    energy = ds.lyapunov(moved[0])
+    energy, error = ds.lyapunov(moved[0]), ds.latent_error(starts[0], times)
     step = -(-count // POINTS)
     missed = [dtw(motion[::step], path[::step]) / len(path[::step]) / size for motion in motions[1:]]
     beside = path[np.arange(len(ball)) * count // len(ball)] + BESIDE * size * ball
@@ -225,11 +230,12 @@ def _measure(ds: System, one: Excerpt, path: Array, around: Array, ball: Array) 
         "fastest": float(torch.linalg.vector_norm(velocity, dim=-1).max()) / one.fastest,
         "rise": float(energy.diff().max() / energy[0]),
         "halves": halves_apart(ds, moved[0], times) / size,
+        "latent_error": 0.0 if error is None else float(error.max()),
     }
 
 
 def halves_apart(ds: System, motion: Tensor, times: Tensor) -> float:
-    """Largest distance of a motion (T, n) at ``times`` (T,) and the same one begun anew half-way: 0 for a flow."""
+    """Largest distance of a motion (T, n) at ``times`` (T,) from the same one begun anew half-way: 0 for a flow."""
     middle = len(times) // 2
     anew = ds.rollout(motion[middle], times[middle:])
     return float(torch.linalg.vector_norm(anew - motion[middle:], dim=-1).max())
