@@ -353,7 +353,7 @@ class _Search:
         fidelity = measure(self.ds, self.shown)
         badness, told = max(fidelity.findings)
         verdict: Verdict = "not falsified" if fidelity.follows else "falsified"
-        return Line(claim, verdict, tries, badness, f"{told}; over the limit")
+        return Line(claim, verdict, tries, badness, f"{told}; share of the limit")
 
     def _judge(self, claim: str, badness: Tensor, limit: float, detail: str, points: Tensor) -> Line:
         """Falsified where ``badness`` (B,) is above ``limit``, or NaN, at one of the ``points`` (B, n)."""
