@@ -218,15 +218,14 @@ def _measure(ds: System, one: Excerpt, path: Array, around: Array, ball: Array) 
         raise ValueError(f"rollout: expected shape {(len(starts), *path.shape)}, got {tuple(moved.shape)}")
     motions = moved.double().cpu().numpy()
     energy, error = ds.lyapunov(moved[0]), ds.latent_error(starts[0], times)
-    step = -(-count // POINTS)
-    missed = [dtw(motion[::step], path[::step]) / len(path[::step]) / size for motion in motions[1:]]
+    missed = [dtw(motion, path) / count / size for motion in motions]
     beside = path[np.arange(len(ball)) * count // len(ball)] + BESIDE * size * ball
     velocity = ds(torch.from_numpy(np.concatenate([path, beside])).to(ds.attractor))
     return {
-        "miss": dtw(motions[0], path) / count / size,
+        "miss": missed[0],
         "length_ratio": path_length_ratio(motions[0], path, one.ruler),
         "end": endpoint_error(motions[0], path) / size,
-        "nearby": float(np.max(missed, initial=0.0)),
+        "nearby": float(np.max(missed[1:], initial=0.0)),
         "fastest": float(torch.linalg.vector_norm(velocity, dim=-1).max()) / one.fastest,
         "rise": float(energy.diff().max() / energy[0]),
         "halves": halves_apart(ds, moved[0], times) / size,
