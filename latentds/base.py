@@ -6,20 +6,24 @@ import inspect
 import json
 import math
 import os
+import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from contextvars import ContextVar
+from dataclasses import asdict, dataclass, replace
+from functools import wraps
 from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from .arguments import check_points, real_tensor, whole_number
-from .demonstration import Demonstration
+from .demonstration import Demonstration, demonstrations_of
 from .deploy.controller import Controller
 from .deploy.tables import FieldTables, field_tables
 from .diffeomorphism import Diffeomorphism
 from .dynamics import LatentDynamics
+from .fidelity import Excerpt, Fidelity, FitWarning, measure
 from .files import write_tensors
 from .integrate import integrate
 
@@ -39,8 +43,10 @@ class FitReport:
         n_layers: layers of the diffeomorphism.
         seconds: wall time of the fit.
         history: loss per epoch, for methods that learn by gradient.
-        notes: what the user should know of this fit (early stop, divergence handled, choices made).
+        notes: what the user should know of this fit (early stop, divergence handled, choices made, what does not
+            follow the demonstration).
         learned_from: name and SHA-256 of each demonstration.
+        fidelity: how the fitted system follows what it was shown, measured after every fit, whatever the method.
     """
 
     mse: float
@@ -49,6 +55,7 @@ class FitReport:
     history: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()
     learned_from: tuple[tuple[str, str], ...] = ()
+    fidelity: Fidelity | None = None
 
 
 class StableDS(nn.Module, ABC):
@@ -56,6 +63,10 @@ class StableDS(nn.Module, ABC):
 
     A new method subclasses this, implements :meth:`fit`, :meth:`forward` and :meth:`lyapunov`, and certifies itself
     with :func:`latentds.testing.check_stable_ds`. An unfitted system is stable too.
+
+    Every ``fit`` is followed by a measurement that the method need not ask for: motions of the fitted system are held
+    against the demonstration (:mod:`latentds.fidelity`). The figures are in ``fit_report.fidelity``; what is off is in
+    ``fit_report.notes`` and in a :class:`~latentds.FitWarning`.
 
     Everything is computed in the module's dtype (float64 unless moved with ``.to``) and returned in the dtype of
     the input. Arrays are accepted where tensors are.
@@ -74,6 +85,12 @@ class StableDS(nn.Module, ABC):
         self.dim = whole_number(dim, "dim", at_least=1)
         self.fit_report = None
         self.register_buffer("attractor", torch.zeros(self.dim, dtype=torch.float64))
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        fit = inspect.getattr_static(cls, "fit")
+        if inspect.isfunction(fit) and not getattr(fit, "__isabstractmethod__", False) and not hasattr(fit, "measured"):
+            cls.fit = _measured(fit)  # type: ignore[method-assign]
 
     @abstractmethod
     def fit(self: Self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> Self:
@@ -105,6 +122,10 @@ class StableDS(nn.Module, ABC):
 
     def tables(self) -> FieldTables | None:
         """The velocity field as plain arrays, for controllers and exporters; None where it cannot be written so."""
+        return None
+
+    def latent_error(self, y0: Tensor, t: Tensor) -> Tensor | None:
+        """What rounding does to the map of a latent system, see :class:`LatentDS`; None for any other."""
         return None
 
     @property
@@ -165,6 +186,52 @@ class StableDS(nn.Module, ABC):
         return torch.cat([start.unsqueeze(-2), path[..., 1:, :]], dim=-2)
 
 
+_UNDERWAY: ContextVar[tuple[int, ...]] = ContextVar("ids of the systems that are being fitted", default=())
+
+
+def _measured(fit: Callable[..., Any]) -> Callable[..., Any]:
+    """``fit`` as a method that holds the fitted system against what it was shown."""
+
+    @wraps(fit)
+    def measured_fit(self: StableDS, *args: Any, **kwargs: Any) -> Any:
+        return _fit(fit, self, args, kwargs)
+
+    measured_fit.measured = True  # type: ignore[attr-defined]
+    return measured_fit
+
+
+def _fit(fit: Callable[..., Any], ds: StableDS, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """Fit and measure: once where a fit calls the one that it overrides; told by the outermost of nested fits alone."""
+    underway = _UNDERWAY.get()
+    if id(ds) in underway:
+        return fit(ds, *args, **kwargs)
+    token = _UNDERWAY.set((*underway, id(ds)))
+    try:
+        fitted = fit(ds, *args, **kwargs)
+    finally:
+        _UNDERWAY.reset(token)
+    notes = _hold_against(ds, args[0] if args else kwargs.get("demonstration"))
+    if notes and not underway:
+        text = f"{type(ds).__name__} does not follow what it was shown: {'; '.join(notes)}"
+        warnings.warn(text, FitWarning, stacklevel=3)
+    return fitted
+
+
+def _hold_against(ds: StableDS, demonstration: Any) -> tuple[str, ...]:
+    """Put into the report how ``ds`` follows its demonstration; what is off."""
+    try:
+        fidelity = measure(ds, Excerpt.of_each(demonstrations_of(demonstration, ds.dim)))
+        notes = fidelity.notes
+    except Exception as error:  # a method's own rollout may raise anything; the fit itself is done and stays
+        fidelity, notes = None, (f"could not be measured, {type(error).__name__}: {error}",)
+    report = ds.fit_report
+    if isinstance(report, FitReport):
+        told = () if report.fidelity is None else report.fidelity.notes
+        before = tuple(note for note in report.notes if note not in told)
+        ds.fit_report = replace(report, fidelity=fidelity, notes=before + notes)
+    return notes
+
+
 class LatentDS(StableDS):
     """A stable system made of a diffeomorphism ψ (latent -> demonstration) and latent dynamics.
 
@@ -203,6 +270,20 @@ class LatentDS(StableDS):
         finite = torch.isfinite(jacobians).all(-1).all(-1)
         safe = torch.where(finite[..., None, None], jacobians, torch.eye(self.dim).to(jacobians))
         return torch.where(finite, torch.linalg.cond(safe), math.inf)
+
+    def latent_error(self, y0: Tensor, t: Tensor) -> Tensor:
+        """How far encode(decode(x)) comes back from x along the latent motion from ``y0``, in the length of its way.
+
+        Invertible on paper is not invertible in floats: where ψ nearly folds, rounding ψ(x) loses x.
+
+        Returns:
+            (..., n), (T,) seconds -> (..., T).
+        """
+        begun = self.encode(y0)
+        x = self.dynamics.flow(begun, self._times(t))
+        way = torch.linalg.vector_norm(begun - self.dynamics.attractor, dim=-1, keepdim=True)
+        error: Tensor = torch.linalg.vector_norm(self.encode(self.decode(x)) - x, dim=-1) / way
+        return error
 
     def tables(self) -> FieldTables | None:
         # A subclass whose velocity is another one must say itself how to write it.

@@ -65,6 +65,7 @@ def compare(
 
         * ``status``: "ok", "diverged" (the rollout holds NaN or inf) or "failed" (``error`` then says what was raised);
           their scores are NaN.
+        * ``follows``: whether the fit measured itself and found nothing off (:mod:`latentds.fidelity`); one per cell.
         * ``dtw``, ``dtw_fast``: exact and FastDTW (radius 1) distance to the demonstration, raw sums; ``…_per_point``
           divided by ``n_points``. ``frechet``, ``endpoint_error``, ``path_length_ratio``: see :mod:`latentds.metrics`.
         * ``converged``: after ``HORIZON`` durations the motion is within ``CONVERGED`` of the demonstration's size from

@@ -6,6 +6,7 @@ import math
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,6 +22,7 @@ from . import kernels, metrics
 from .arguments import number_in, whole_number
 from .base import StableDS
 from .demonstration import Demonstration
+from .fidelity import FitWarning
 
 Factory = Callable[[int], StableDS]
 
@@ -35,7 +37,7 @@ SCORES = (
     "dtw", "dtw_fast", "dtw_per_point", "dtw_fast_per_point", "frechet", "endpoint_error", "path_length_ratio",
     "velocity_rmse", "velocity_cosine", "mse", "n_parameters", "n_layers", "fit_seconds", "rollout_seconds",
 )  # fmt: skip
-COLUMNS = ("method", "demonstration", "seed", "start", "status", "error", "converged", *SCORES)
+COLUMNS = ("method", "demonstration", "seed", "start", "status", "error", "follows", "converged", *SCORES)
 
 
 @dataclass(frozen=True)
@@ -178,6 +180,7 @@ def evaluate(cell: Cell, protocol: Protocol) -> Outcome:
     shown, judges, share = cell.shown, cell.judges, protocol.n_starts + 1
     paths = np.full((len(judges), share, protocol.n_points, shown[0].dim), np.nan)
     converged = np.zeros((len(judges), share), dtype=bool)
+    follows = False
     facts: dict[str, Any] = dict.fromkeys(SCORES, math.nan)
     of_judge: list[dict[str, float]] = [{} for _ in judges]
     error = ""
@@ -186,8 +189,11 @@ def evaluate(cell: Cell, protocol: Protocol) -> Outcome:
             ds = build(cell)
             kernels.warmup([ds.dim])  # compiling is nobody's fitting time
             began = time.perf_counter()
-            ds.fit(shown[0] if len(shown) == 1 else list(shown))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", FitWarning)  # the rows tell it
+                ds.fit(shown[0] if len(shown) == 1 else list(shown))
             facts["fit_seconds"] = time.perf_counter() - began
+            follows = bool(ds.fit_report and ds.fit_report.fidelity and ds.fit_report.fidelity.follows)
             of_judge = [_velocity_scores(ds, judge) for judge in judges]
             more = dict(cell.measure(ds, cell)) if cell.measure else {}
             if taken := more.keys() & {*COLUMNS, "judge"}:
@@ -207,7 +213,12 @@ def evaluate(cell: Cell, protocol: Protocol) -> Outcome:
         error = f"{type(raised).__name__}: {raised}"
     rows = [
         {"method": cell.method, "demonstration": cell.demonstration, "seed": cell.seed, "start": share * i + k}
-        | {"status": _status(error, path), "error": error, "converged": bool(converged[i, k])}
+        | {
+            "status": _status(error, path),
+            "error": error,
+            "follows": follows and not error,
+            "converged": bool(converged[i, k]),
+        }
         | {"judge": judge.name}
         | facts
         | of_judge[i]

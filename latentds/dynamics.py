@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
@@ -41,7 +42,10 @@ class LatentDynamics(nn.Module, ABC):
         return (x - self.attractor).square().sum(-1)
 
     def convergence_rate_bound(self, radius: float) -> float | None:
-        """A lower bound on -V̇/(2V) within ``radius`` of x*, per second, that holds by construction; None if unknown."""
+        """A lower bound on -V̇/(2V) within ``radius`` of x*, per second, that holds by construction; None if unknown.
+
+        It is taken from the numbers that run; where they break what it rests on, it is not above 0.
+        """
         return None
 
     def check_buffers(self, buffers: Mapping[str, Tensor]) -> None:
@@ -93,7 +97,8 @@ class RayDynamics(LatentDynamics):
         return self.attractor + _shrink(self.law, _off_zero(offset / self.length), t) * offset
 
     def convergence_rate_bound(self, radius: float) -> float:
-        return self.law.convergence_rate_bound(radius / float(self.length))
+        length = float(self.length)
+        return self.law.convergence_rate_bound(radius / length) if length > 0 else -math.inf
 
     def check_buffers(self, buffers: Mapping[str, Tensor]) -> None:
         check_positive(buffers, "length")
@@ -147,7 +152,11 @@ class TubeDynamics(LatentDynamics):
         return self.attractor + self.length * (left + _shrink(self.transverse_law, _off_zero(across), t) * across)
 
     def convergence_rate_bound(self, radius: float) -> float:
-        reach = radius / float(self.length)
+        length, dtype = float(self.length), self.axis.dtype
+        unit = abs(float(torch.linalg.vector_norm(self.axis.to(torch.float64))) - 1) <= 8 * torch.finfo(dtype).eps
+        if not (length > 0 and unit):  # by an axis that is longer, what lies along it would also be pushed back
+            return -math.inf
+        reach = radius / length
         return min(self.law.convergence_rate_bound(reach), self.transverse_law.convergence_rate_bound(reach))
 
     def check_buffers(self, buffers: Mapping[str, Tensor]) -> None:

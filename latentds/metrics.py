@@ -13,7 +13,7 @@ import numpy as np
 from fastdtw import fastdtw
 from numpy.typing import NDArray
 
-from .arguments import real_array, whole_number
+from .arguments import number_in, real_array, whole_number
 from .kernels.compiling import cached
 
 Array = NDArray[np.float64]
@@ -79,16 +79,29 @@ def endpoint_error(path: Any, reference: Any) -> float:
     return float(np.linalg.norm(a[-1] - b[-1])) if _finite(a, b) else NAN
 
 
-def path_length_ratio(path: Any, reference: Any) -> float:
+def path_length_ratio(path: Any, reference: Any, ruler: float = 0.0) -> float:
     """Length of the path over that of the reference, (N, n) and (M, n): far below 1 gives a shortcut away.
 
-    NaN where the reference does not move.
+    NaN where the reference does not move. Steps up to ``ruler`` (units of the positions, >= 0) from the last point
+    counted are left out, in both, so that noise does not count as way.
     """
     a, b = _pair(path, reference)
+    number_in(ruler, "ruler", 0, math.inf, ends="[)")
     if not _finite(a, b):
         return NAN
-    travelled, shown = (float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum()) for p in (a, b))
+    travelled, shown = path_length(a, ruler), path_length(b, ruler)
     return travelled / shown if shown > 0 else NAN
+
+
+def path_length(path: Array, ruler: float = 0.0) -> float:
+    """Length of a path (N, n) from the first point to the last, by steps longer than ``ruler``."""
+    here, *rest = path.tolist()
+    total = 0.0
+    for there in rest:
+        step = math.dist(here, there)
+        if step > ruler:
+            total, here = total + step, there
+    return total + math.dist(here, path[-1].tolist())
 
 
 def mse(values: Any, reference: Any) -> float:

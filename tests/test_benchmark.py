@@ -3,6 +3,7 @@
 import ctypes
 import math
 import signal
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import joblib
@@ -208,6 +209,16 @@ def test_a_rollout_that_diverges_is_told_start_by_start():
     rows = compare({"explosive": Explosive}, SPIRAL, **QUICK)
     assert list(rows["status"]) == ["ok", "diverged", "ok", "ok"]
     assert list(rows["dtw"].isna()) == [False, True, False, False]
+
+
+def test_rows_tell_what_follows_and_nothing_else_does():
+    methods = {"FDM": lambda dim: FDM(dim, n_layers=60), "straight": Straight, "explosive": Explosive}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rows = compare(methods, SPIRAL, **QUICK)
+    assert rows["follows"].dtype == bool
+    assert rows.groupby("method")["follows"].mean().to_dict() == {"FDM": 1, "straight": 0, "explosive": 0}
+    assert set(rows[rows["method"] == "straight"]["status"]) == {"ok"}
 
 
 @pytest.mark.parametrize("method", [Lost, Slow])

@@ -277,7 +277,7 @@ BAD = {
     ),
     "half a report": (
         lambda p: written(p, report={"mse": 0.0}),
-        "report: expected the fields of FitReport, .*: .'history', .*'seconds'",
+        "report: expected the fields of FitReport, .*: .*'history', .*'seconds'",
     ),
     "mistyped report": (
         lambda p: written(p, report=asdict(FitReport(0.0, 1, "soon"))),
