@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import copy
+import hashlib
 import inspect
 import json
 import math
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar, TypeVar
 
 import torch
@@ -19,9 +21,11 @@ from .demonstration import Demonstration
 from .deploy.controller import Controller
 from .deploy.tables import FieldTables, field_tables
 from .diffeomorphism import Diffeomorphism
-from .dynamics import LatentDynamics
+from .dynamics import Frame, LatentDynamics
 from .files import write_tensors
 from .integrate import integrate
+from .kernels.dispatch import no_active_transforms
+from .memory import Memo, tensors_of
 
 FORMAT = 2
 """Of the files of systems; raised when they change so that another latentds would misread them."""
@@ -41,6 +45,7 @@ class FitReport:
         history: loss per epoch, for methods that learn by gradient.
         notes: what the user should know of this fit (early stop, divergence handled, choices made).
         learned_from: name and SHA-256 of each demonstration.
+        state: SHA-256 of the system's state after the fit, to the precision of float32; filled in by the system.
     """
 
     mse: float
@@ -49,6 +54,7 @@ class FitReport:
     history: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()
     learned_from: tuple[tuple[str, str], ...] = ()
+    state: str = ""
 
 
 class StableDS(nn.Module, ABC):
@@ -57,23 +63,43 @@ class StableDS(nn.Module, ABC):
     A new method subclasses this, implements :meth:`fit`, :meth:`forward` and :meth:`lyapunov`, and certifies itself
     with :func:`latentds.testing.check_stable_ds`. An unfitted system is stable too.
 
-    Everything is computed in the module's dtype (float64 unless moved with ``.to``) and returned in the dtype of
-    the input. Arrays are accepted where tensors are.
+    Everything is computed in the module's dtype (float64 unless moved with ``.to``; float32 is the narrowest) and
+    returned in the dtype of the input. Arrays are accepted where tensors are.
 
     Args:
         dim: n >= 1.
+
+    Attributes:
+        attractor: y*, (n,), where all motions end. What a method's ``fit`` writes into the buffer, the motion follows;
+            it is not to be replaced.
     """
 
     report_type: ClassVar[type[FitReport]] = FitReport
     """The class of ``fit_report``; a method that tells more than every method does names its own."""
     attractor: Tensor
-    fit_report: FitReport | None
+    _fit_report: FitReport | None
 
     def __init__(self, dim: int) -> None:
         super().__init__()
         self.dim = whole_number(dim, "dim", at_least=1)
         self.fit_report = None
         self.register_buffer("attractor", torch.zeros(self.dim, dtype=torch.float64))
+
+    @property
+    def fit_report(self) -> FitReport | None:
+        """What the last fit reached; None before one. A ``fit`` sets it last, once the parameters are found."""
+        return self._fit_report
+
+    @fit_report.setter
+    def fit_report(self, report: FitReport | None) -> None:
+        if report is not None and not report.state:
+            report = replace(report, state=self._fingerprint())
+        self._fit_report = report
+
+    @property
+    def fit_report_is_current(self) -> bool:
+        """Whether ``fit_report`` tells of this system as it is: fitted, and neither trained nor edited since."""
+        return self.fit_report is not None and self.fit_report.state == self._fingerprint()
 
     @abstractmethod
     def fit(self: Self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> Self:
@@ -138,6 +164,35 @@ class StableDS(nn.Module, ABC):
             raise ValueError(f"ds: expected a fit_report of numbers, strings and tuples, got {error}") from None
         write_tensors(path, self.state_dict(), about)
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        held = self.__dict__.get("_buffers", {}).get("attractor")
+        if name == "attractor" and held is not None and value is not held and not self.__dict__.get("_assigning"):
+            raise AttributeError("attractor: cannot be replaced; ds.with_goal(goal) is this motion to another goal")
+        super().__setattr__(name, value)
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        self.__dict__["_assigning"] = True  # load_state_dict(…, assign=True) replaces the attractor with all the rest
+        try:
+            super()._load_from_state_dict(*args, **kwargs)
+        finally:
+            del self.__dict__["_assigning"]
+
+    def _apply(self: Self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        dtype = fn(torch.zeros_like(self.attractor)).dtype
+        if dtype not in (torch.float32, torch.float64):
+            raise ValueError(
+                f"dtype: expected torch.float64 or torch.float32, got {dtype}, whose rounding, layer after layer, "
+                "makes another system; inputs of any real dtype are answered in it"
+            )
+        moved: Self = super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        return moved
+
+    def _fingerprint(self) -> str:
+        digest = hashlib.sha256()
+        for name, value in self.state_dict().items():
+            digest.update(name.encode() + value.detach().to("cpu", torch.float32).numpy().tobytes())
+        return digest.hexdigest()
+
     def _points(self, y: Any, name: str = "y") -> tuple[Tensor, torch.dtype]:
         """``y`` in the module's dtype, and the dtype in which the caller wants the answer."""
         points = real_tensor(y, name)
@@ -170,16 +225,60 @@ class LatentDS(StableDS):
 
     f(y) = J_ψ(x) g(x) with x = ψ⁻¹(y) (paper, eq. 4), V(y) = ‖x - x*‖². Methods subclass it and implement ``fit``.
 
+    What was shown is kept in demonstration space; its latent image, :meth:`frame`, follows from it. So the attractor
+    stays where it is however ψ is trained, and where it is moved in place, motions end there.
+
     Args:
         dim: n >= 1.
         diffeomorphism: ψ; the identity until fitted.
         dynamics: g, with its flow.
+
+    Attributes:
+        start: (n,) buffer, where the demonstrated motion begins; the first unit vector until fitted.
     """
+
+    start: Tensor
+    _memo: Memo[Frame]
 
     def __init__(self, dim: int, diffeomorphism: Diffeomorphism, dynamics: LatentDynamics) -> None:
         super().__init__(dim)
+        self.register_buffer("start", torch.eye(1, self.dim, dtype=torch.float64)[0])
         self.diffeomorphism = diffeomorphism
         self.dynamics = dynamics
+        self._memo = Memo[Frame]()
+
+    def frame(self) -> Frame:
+        """The latent attractor, axis and length, as ψ, ``attractor`` and ``start`` make them now."""
+        return self._kept_frame() or self._new_frame()
+
+    def _kept_frame(self) -> Frame | None:
+        """The frame, made anew when something changed; None where a derivative or a transform must see it made."""
+        psi, attractor = self.diffeomorphism, self.attractor
+        sources = [attractor, self.start, *tensors_of(psi)]
+        differentiated = torch.is_grad_enabled() and any(source.requires_grad for source in sources)
+        if differentiated or attractor.is_meta or not no_active_transforms():
+            return None
+        return self._memo.of((psi, attractor.dtype), sources, self._new_frame)
+
+    def _new_frame(self) -> Frame:
+        return Frame.between(*self.diffeomorphism.inverse(self._ends()).unbind())
+
+    def _ends(self) -> Tensor:
+        return torch.stack([self.start, self.attractor])
+
+    def _linearize(self, y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor], Frame]:
+        """x = ψ⁻¹(y), the map of tangents by J_ψ(x), and the frame; in one sweep, if the frame is to be made."""
+        frame = self._kept_frame()
+        if frame is not None:
+            return *self.diffeomorphism.linearize(y), frame
+        ends = self._ends()
+        rows, push_rows = self.diffeomorphism.linearize(torch.cat([y.reshape(-1, self.dim), ends]))
+
+        def push(tangent: Tensor) -> Tensor:
+            tangents = torch.cat([tangent.reshape(-1, self.dim), torch.zeros_like(ends)])
+            return push_rows(tangents)[:-2].reshape(tangent.shape)
+
+        return rows[:-2].reshape(y.shape), push, Frame.between(rows[-2], rows[-1])
 
     def encode(self, y: Tensor) -> Tensor:
         """ψ⁻¹: demonstration -> latent, (..., n) -> (..., n)."""
@@ -205,20 +304,23 @@ class LatentDS(StableDS):
         return torch.where(finite, torch.linalg.cond(safe), math.inf)
 
     def tables(self) -> FieldTables | None:
-        # A subclass whose velocity is another one must say itself how to write it.
-        return field_tables(self.diffeomorphism, self.dynamics) if type(self).forward is LatentDS.forward else None
+        if type(self).forward is not LatentDS.forward:
+            return None  # a subclass whose velocity is another one must say itself how to write it
+        exact = copy.deepcopy(self).to("cpu", torch.float64)
+        return field_tables(exact.diffeomorphism, exact.dynamics, exact.frame())
 
     def forward(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
-        x, push = self.diffeomorphism.linearize(points)
-        return push(self.dynamics(x, points)).to(wanted)
+        x, push, frame = self._linearize(points)
+        return push(self.dynamics(x, points, frame)).to(wanted)
 
     def lyapunov(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
-        return self.dynamics.lyapunov(self.diffeomorphism.inverse(points)).to(wanted)
+        x, _, frame = self._linearize(points)
+        return self.dynamics.lyapunov(x, frame).to(wanted)
 
     def rollout(self, y0: Tensor, t: Tensor) -> Tensor:
         points, wanted = self._points(y0, "y0")
         times = self._times(t)
-        latent = self.dynamics.flow(self.diffeomorphism.inverse(points), times)
-        return self._begun_at(y0, self.diffeomorphism(latent).to(wanted))
+        x, _, frame = self._linearize(points)
+        return self._begun_at(y0, self.diffeomorphism(self.dynamics.flow(x, times, frame)).to(wanted))

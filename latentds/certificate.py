@@ -153,9 +153,10 @@ class _Search:
 
     def _rate(self, ds: LatentDS) -> list[Line]:
         with torch.no_grad():
-            reach = torch.linalg.vector_norm(ds.encode(self.points) - ds.dynamics.attractor, dim=-1)
+            frame = ds.frame()
+            reach = torch.linalg.vector_norm(ds.encode(self.points) - frame.attractor, dim=-1)
             radius = float(reach[torch.isfinite(reach)].max()) if bool(torch.isfinite(reach).any()) else 1.0
-            rate = ds.dynamics.convergence_rate_bound(radius)
+            rate = ds.dynamics.convergence_rate_bound(radius, frame)
         if rate is None:
             return []
         claim = "latent motions approach the goal, -V̇/2V >= rate > 0"
@@ -167,7 +168,7 @@ class _Search:
             later = self.ds.rollout(self.goal, torch.tensor([0.0, self.duration], dtype=torch.float64))
             errors = [speed, float((later[-1] - self.goal).abs().max()) / self.size]
             if isinstance(self.ds, LatentDS):
-                errors.append(float((self.ds.decode(self.ds.dynamics.attractor) - self.goal).abs().max()) / self.size)
+                errors.append(float((self.ds.decode(self.ds.frame().attractor) - self.goal).abs().max()) / self.size)
         worst = torch.tensor(errors).nan_to_num(nan=math.inf).amax().expand(1)
         return self._judge("the attractor rests", worst, self.tolerance, "relative error", self.goal.unsqueeze(0))
 
@@ -308,14 +309,14 @@ def _region(ds: StableDS, region: Any, generator: torch.Generator) -> Tensor:
         if corners.shape != (2, ds.dim) or not np.isfinite(corners).all() or not (corners[0] < corners[1]).all():
             raise ValueError(f"region: expected (2, {ds.dim}) finite corners, low below high, got {corners.tolist()}")
         return torch.from_numpy(corners)
-    length = getattr(ds.dynamics, "length", None) if isinstance(ds, LatentDS) else None
-    if not isinstance(ds, LatentDS) or length is None:
+    if not isinstance(ds, LatentDS):
         raise ValueError(f"region: expected (2, {ds.dim}) corners, as {type(ds).__name__} implies none, got None")
     draws = torch.randn(256, ds.dim, generator=generator, dtype=torch.float64)
     directions = torch.nn.functional.normalize(draws, dim=-1)
     radii = torch.linspace(0.1, 1, 256, dtype=torch.float64).unsqueeze(-1)
     with torch.no_grad():
-        ball = ds.dynamics.attractor + length * (radii * directions).to(ds.attractor)
+        frame = ds.frame()
+        ball = frame.attractor + frame.length * (radii * directions).to(ds.attractor)
         points = torch.cat([ds.decode(ball), ds.attractor.unsqueeze(0)]).cpu().double()
     points = points[torch.isfinite(points).all(-1)]
     low, high = points.amin(0), points.amax(0)
