@@ -327,6 +327,31 @@ class ForgetsInARefusedFit(Plain):
         return super().fit(demonstration)
 
 
+class RemembersItsLatentAttractor(Latent):
+    """What its frame was at first, whatever the map has become."""
+
+    def __init__(self, dim):
+        super().__init__(dim)
+        self.known = super().frame()
+
+    def fit(self, demonstration, *, progress=False):
+        super().fit(demonstration)
+        with torch.no_grad():
+            self.known = super().frame()
+        return self
+
+    def _linearize(self, y):
+        return *super()._linearize(y)[:2], self.known
+
+
+class ReportsTooEarly(Plain):
+    def fit(self, demonstration, *, progress=False):
+        super().fit(demonstration)
+        with torch.no_grad():
+            self.rate *= 2
+        return self
+
+
 class KeepsAView(Plain):
     """The attractor lies in the demonstration's memory."""
 
@@ -443,6 +468,8 @@ BROKEN = {
     CannotBePickled: "check_serialization: pickle",
     ReturnsNothing: "check_report: return self",
     LeavesNoReport: "check_report: fit_report",
+    RemembersItsLatentAttractor: "check_training: speed",
+    ReportsTooEarly: "check_report: set it last",
     KeepsAView: "check_memory: attractor after the demonstration was changed",
     ChangesTheDemonstration: "check_memory: the demonstration after fit",
     RemembersTheLastFit: "check_repeatability: refit",
