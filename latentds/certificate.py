@@ -173,9 +173,11 @@ class _Search:
 
         Where the numbers break what the proof rests on, samples must do.
         """
-        claim, goal = "latent motions approach the goal, -V̇/2V >= rate > 0", ds.dynamics.attractor
+        claim = "latent motions approach the goal, -V̇/2V >= rate > 0"
         with torch.no_grad():
-            x = torch.cat([ds.encode(self.points), ds.dynamics.flow(ds.encode(self.starts), self.times).flatten(0, 1)])
+            frame = ds.frame()
+            goal = frame.attractor
+            x = torch.cat([ds.encode(self.points), ds.latent_motion(self.starts, self.times).flatten(0, 1)])
             reach = torch.linalg.vector_norm(x - goal, dim=-1)
             x = x[torch.isfinite(reach) & (reach > 0)]
             box, where = ds.diffeomorphism.inverse_box(self.box[0], self.box[1]), "in the region"
@@ -184,11 +186,11 @@ class _Search:
             else:
                 farthest = torch.maximum((box[0] - goal).abs(), (box[1] - goal).abs()).unsqueeze(0)
             radius = float(torch.linalg.vector_norm(farthest, dim=-1).max())
-            bound = ds.dynamics.convergence_rate_bound(radius)
+            bound = ds.dynamics.convergence_rate_bound(radius, frame)
             if bound is not None and 0 < bound < math.inf:
                 return Line(claim, "proven", 1, bound, f"least rate {where}, per second:")
             offset, points = x - goal, ds.decode(x)
-            rates = -(ds.dynamics(x, points) * offset).sum(-1) / offset.square().sum(-1)
+            rates = -(ds.dynamics(x, points, frame) * offset).sum(-1) / offset.square().sum(-1)
         rates = rates.nan_to_num(nan=-math.inf)
         worst = int(rates.argmin())
         holds = bool(rates[worst] > 0)
@@ -202,20 +204,20 @@ class _Search:
             later = self.ds.rollout(self.goal, torch.tensor([0.0, self.duration], dtype=torch.float64))
             errors = [speed, float((later[-1] - self.goal).abs().max()) / self.size]
             if isinstance(self.ds, LatentDS):
-                errors.append(float((self.ds.decode(self.ds.dynamics.attractor) - self.goal).abs().max()) / self.size)
+                errors.append(float((self.ds.decode(self.ds.frame().attractor) - self.goal).abs().max()) / self.size)
         worst = torch.tensor(errors).nan_to_num(nan=math.inf).amax().expand(1)
         return self._judge("the attractor rests", worst, self.tolerance, "relative error", self.goal.unsqueeze(0))
 
     def _maps(self, ds: LatentDS) -> list[Line]:
         """ψ, its inverse and its Jacobian, at the samples and where their motions run."""
         with torch.no_grad():
-            begun = ds.encode(self.starts)
-            x = ds.dynamics.flow(begun, self.times).flatten(0, 1)
+            motions = ds.latent_motion(self.starts, self.times)
+            x = motions.flatten(0, 1)
             y = ds.decode(x)
             points = torch.cat([self.points, y])
             there = torch.linalg.vector_norm(ds.decode(ds.encode(points)) - points, dim=-1) / self.size
             # In the longest way to the goal: of a demonstration, if there is one.
-            way = torch.linalg.vector_norm(begun - ds.dynamics.attractor, dim=-1, keepdim=True)
+            way = torch.linalg.vector_norm(motions[:, 0] - ds.frame().attractor, dim=-1, keepdim=True)
             back = ds.latent_error(self.starts, self.times) * way / way[: len(self.shown) or None].max()
         return [
             self._judge("decode inverts encode", there, self.tolerance, "relative error", points),
@@ -393,14 +395,14 @@ def _region(ds: StableDS, region: Any, generator: torch.Generator) -> Tensor:
         if corners.shape != (2, ds.dim) or not np.isfinite(corners).all() or not (corners[0] < corners[1]).all():
             raise ValueError(f"region: expected (2, {ds.dim}) finite corners, low below high, got {corners.tolist()}")
         return torch.from_numpy(corners)
-    length = getattr(ds.dynamics, "length", None) if isinstance(ds, LatentDS) else None
-    if not isinstance(ds, LatentDS) or length is None:
+    if not isinstance(ds, LatentDS):
         raise ValueError(f"region: expected (2, {ds.dim}) corners, as {type(ds).__name__} implies none, got None")
     draws = torch.randn(256, ds.dim, generator=generator, dtype=torch.float64)
     directions = torch.nn.functional.normalize(draws, dim=-1)
     radii = torch.linspace(0.1, 1, 256, dtype=torch.float64).unsqueeze(-1)
     with torch.no_grad():
-        ball = ds.dynamics.attractor + length * (radii * directions).to(ds.attractor)
+        frame = ds.frame()
+        ball = frame.attractor + frame.length * (radii * directions).to(ds.attractor)
         points = torch.cat([ds.decode(ball), ds.attractor.unsqueeze(0)]).cpu().double()
     points = points[torch.isfinite(points).all(-1)]
     low, high = points.amin(0), points.amax(0)

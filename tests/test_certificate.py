@@ -45,13 +45,13 @@ class Sound(LatentDS):
     """A bent space with one ray to the goal, at (1, 0)."""
 
     def __init__(self, dim=2):
-        super().__init__(dim, LocallyWeightedTranslations(dim, 3), RayDynamics(dim, PiecewiseLinearLaw.uniform()))
+        super().__init__(dim, LocallyWeightedTranslations(dim, 3), RayDynamics(PiecewiseLinearLaw.uniform()))
         psi, draw = self.diffeomorphism, torch.Generator().manual_seed(1)
         with torch.no_grad():
             psi.centers.normal_(generator=draw)
             psi.strengths.normal_(generator=draw)
             self.attractor[0] = 1
-            self.dynamics.set_endpoints(psi.inverse(-self.attractor), psi.inverse(self.attractor))
+            self.start.copy_(-self.attractor)
 
     def fit(self, demonstration, *, progress=False):
         return self

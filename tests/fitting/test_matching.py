@@ -121,7 +121,7 @@ def test_attractor_is_the_end_of_the_demonstration(method, dim):
         end = ds.rollout(shown.start, torch.tensor([0.0, 100 * shown.duration]))[-1]
         assert (ds.attractor - shown.goal).abs().max() < 1e-9
         assert (end - shown.goal).abs().max() < 1e-9
-        assert (ds.decode(ds.dynamics.attractor) - shown.goal).abs().max() < 1e-9
+        assert (ds.decode(ds.frame().attractor) - shown.goal).abs().max() < 1e-9
 
 
 @pytest.mark.parametrize("c", [7, 15])
