@@ -326,7 +326,11 @@ def test_the_rate_that_is_proven_holds_in_all_of_the_region(method, dim, corner)
 
 
 def test_a_map_without_a_bound_says_that_the_rate_is_of_samples():
-    (line,) = [line for line in certify(SDSEF(2, n_layers=2, n_features=5, seed=0), n_samples=20).lines if "latent motions" in line.claim]
+    (line,) = [
+        line
+        for line in certify(SDSEF(2, n_layers=2, n_features=5, seed=0), n_samples=20).lines
+        if "latent motions" in line.claim
+    ]
     assert "where samples lie" in line.detail
 
 
