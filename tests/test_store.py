@@ -508,3 +508,18 @@ except KeyboardInterrupt: print("interrupted")"""
     assert time.monotonic() - began < 30
     with CellStore(file) as store:
         assert 3 < len(store) < len(kill.cells(60))
+
+
+def test_this_librarys_code_counts_once_and_for_all(monkeypatch):
+    """For what comes from it and for what does not."""
+    things = (1.5, ChebyshevDS(2, n_layers=2), FDM(2, n_layers=2))
+    before = [fingerprint(thing) for thing in things]
+    known, ours = store._package, str(Path(store.__file__).parent)
+    monkeypatch.setattr(store, "_package", lambda folder: b"edited" if folder == ours else known(folder))
+    assert all(was != fingerprint(thing) for was, thing in zip(before, things, strict=True))
+
+
+def test_a_store_takes_no_pickles(file):
+    row = {"method": "a", "demonstration": "b", "seed": 0}
+    with CellStore(file) as store, pytest.raises(ValueError, match="Object arrays cannot be saved"):
+        store.put("key", (row,), np.array([None]))
