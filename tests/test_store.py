@@ -494,7 +494,8 @@ def test_ctrl_c_ends_with_what_is_done(file):
     code = f"""
 from experiments import kill
 try: kill.work({str(file)!r}, 2, 60)
-except KeyboardInterrupt: print("interrupted")"""
+except KeyboardInterrupt: print("interrupted", flush=True)
+else: print("ran to its end", flush=True)"""
     child = subprocess.Popen(
         [sys.executable, "-c", code], start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
@@ -502,7 +503,7 @@ except KeyboardInterrupt: print("interrupted")"""
     os.killpg(child.pid, signal.SIGINT)  # as a terminal does
     began = time.monotonic()
     out, err = child.communicate(timeout=60)
-    assert out == b"interrupted\n", err
+    assert out == b"interrupted\n", (child.returncode, err)
     idle = err.count(b"Process LokyProcess")  # joblib's own workers between two cells may tell where they were hit
     assert err.count(b"Traceback") == idle, err
     assert time.monotonic() - began < 30
