@@ -496,8 +496,13 @@ from experiments import kill
 try: kill.work({str(file)!r}, 2, 60)
 except KeyboardInterrupt: print("interrupted", flush=True)
 else: print("ran to its end", flush=True)"""
+    # A shell's background jobs ignore SIGINT, and their children with them; a terminal's do not.
     child = subprocess.Popen(
-        [sys.executable, "-c", code], start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        [sys.executable, "-c", code],
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     kill._wait_for_more_than(3, file, child)
     os.killpg(child.pid, signal.SIGINT)  # as a terminal does
