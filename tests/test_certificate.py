@@ -67,7 +67,7 @@ class FlipsTheSign(Sound):
 
 
 class FlipsTheSignSomewhere(Sound):
-    """Only within .15 of a place that few samples hit; ascent on V̇/V finds the rim."""
+    """Only within 0.15 of a place that few samples hit; ascent on V̇/V finds the rim."""
 
     place = (-0.4, 0.3)
 
