@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 ROOMS = (
     "arguments", "memory", "files", "demonstration", "recordings", "datasets", "time_law", "kernels", "diffeomorphism",
-    "dynamics", "deploy", "integrate", "metrics", "base", "wrappers", "fitting", "methods", "storage", "store",
+    "dynamics", "deploy", "similarity", "integrate", "metrics", "base", "fitting", "methods", "storage", "store",
     "certificate", "testing", "cell", "benchmark", "plotting", "report", "cli",
 )  # fmt: skip
 """Of latentds; each may import itself and those before it."""

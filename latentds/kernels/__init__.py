@@ -17,6 +17,7 @@ def warmup(dims: Sequence[int] = (2, 3)) -> None:
             inverse_kernel(dim, block)
             for tangents in {0, 1, dim}:
                 forward_kernel(dim, tangents, block)
-        velocity_kernel(dim)
+        for tangents in (0, dim):
+            velocity_kernel(dim, tangents)
     pack_kernel()
     greedy_kernel()
