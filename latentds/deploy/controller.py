@@ -180,8 +180,10 @@ class Controller:
         velocity: torch.Tensor = speed * self._ds(y - shift)
         if math.isinf(limit):
             return velocity
-        length = torch.linalg.vector_norm(velocity, dim=-1, keepdim=True)
-        return velocity * (limit / length.clamp(min=limit))
+        shortened: torch.Tensor = velocity * (
+            limit / torch.linalg.vector_norm(velocity, dim=-1, keepdim=True).clamp(limit)
+        )
+        return shortened
 
     def _room(self) -> Array:
         """The kernel's, one for each thread, with goal, speed and limit as they are now."""
