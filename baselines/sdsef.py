@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -193,7 +194,10 @@ class NormalizedDescent(LatentDynamics):
         return states
 
     def convergence_rate_bound(self, radius: float, frame: Frame) -> float:
-        slowest = float(torch.exp(self.log_speed_range[0]) / self.duration)
+        finite = all(bool(torch.isfinite(part).all()) for part in self.state_dict().values())
+        if not (finite and self.duration > 0 and frame.length > 0):
+            return -math.inf
+        slowest = float(torch.exp(self.log_speed_range.min()) / self.duration)
         return slowest / max(radius, GUARD * float(frame.length))
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:

@@ -29,7 +29,7 @@ from experiments.goals import Goal, at_most
 from experiments.methods import GREEDY, greedy, setting
 from experiments.motions import handwriting, recordings, spirals
 from experiments.published import TABLE_ONE
-from latentds import Demonstration, TubeDS, datasets, metrics
+from latentds import Demonstration, TubeDS, datasets
 from latentds.base import LatentDS
 from latentds.benchmark import Cell, Factory, Outcome, Protocol, run
 from latentds.fitting.matching import PINS
@@ -129,7 +129,7 @@ def costs(ds: LatentDS, cell: Cell) -> dict[str, Any]:
     """cond(J) along the path, whether the attractor is the goal, and what TubeDS reports beside it."""
     shown = cell.shown[0]
     with torch.no_grad():
-        condition = metrics.path_condition(ds.jacobian(ds.encode(shown.positions)))
+        condition = float(ds.condition_number(ds.encode(shown.positions)).max())
         exact = bool((ds.attractor - shown.goal).abs().max() <= 1e-9 * shown.size)
     names = ("isotopy", "condition_path", "condition_tube", "largest_velocity", "largest_gradient")
     reported = {name: value for name, value in vars(ds.fit_report).items() if name in names}

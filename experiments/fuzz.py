@@ -1,4 +1,4 @@
-"""Hostile demonstrations: each ends in a stable system that its certificate does not falsify, or in a ValueError.
+"""Hostile demonstrations: each ends in a system that follows it, in one that says it does not, or in a ValueError.
 
 Run it with ``make fuzz``; ``ARGS="--cases 5000 --seed 3"`` changes what is tried. Leaves results/fuzz/cases.csv.
 """
@@ -164,10 +164,8 @@ def _flawed(path: NDArray[np.float64], flaw: str, draw: np.random.Generator) -> 
     elif flaw == "near loop":
         path[-1] = path[0] + 10.0 ** draw.uniform(-15, -3) * draw.normal(size=path.shape[1])
     elif flaw in ("nan", "inf"):
-        first = int(draw.choice([middle, int(draw.integers(count))]))
-        path[first : draw.choice([first + 1, count]), draw.integers(path.shape[1])] = (
-            math.nan if flaw == "nan" else draw.choice([-math.inf, math.inf])
-        )
+        number = math.nan if flaw == "nan" else draw.choice([-math.inf, math.inf])
+        path[middle : draw.choice([middle + 1, count]), draw.integers(path.shape[1])] = number
     elif flaw == "equal":
         path[draw.choice([0, count // 4]) :] = path[0]
     elif flaw != "none":
@@ -209,8 +207,14 @@ def cases(largest: int = 5000) -> st.SearchStrategy[Case]:
     )
 
 
+FOLLOWS, SAYS = "follows", "says that it does not follow"
+ROUNDING = ("decode inverts encode", "encode inverts decode", "V falls along motions", "a motion is its two halves",
+            "ψ neither folds nor flattens space", "V is above 0, and falls to 0 at the attractor")  # fmt: skip
+"""Claims that only floats break, in fits that say so."""
+
+
 def outcome(case: Case) -> str:
-    """What became of a case: "stable", "ValueError: …", or, if the promise is broken, "BROKEN …"."""
+    """What became of a case: ``FOLLOWS``, ``SAYS``, "ValueError: …", or, if the promise is broken, "BROKEN …"."""
     try:
         shown = Demonstration(case.positions(), case.dt)
         ds = METHODS[case.method](case.dim).fit(shown)
@@ -228,9 +232,14 @@ def outcome(case: Case) -> str:
         certificate = certify(ds, n_samples=40)
     except Exception as error:
         return f"BROKEN after the fit, {type(error).__name__}: {error}"
-    if not certificate.holds:
-        return "BROKEN certificate: " + "; ".join(str(line) for line in certificate.falsified)
-    return "stable"
+    assert ds.fit_report is not None
+    silent = ds.fit_report.fidelity is None or ds.fit_report.fidelity.follows
+    broken = [
+        line for line in certificate.falsified if silent or line.claim not in (*ROUNDING, "follows its demonstration")
+    ]
+    if broken:
+        return "BROKEN certificate: " + "; ".join(str(line) for line in broken)
+    return FOLLOWS if silent else SAYS
 
 
 def summary(results: list[tuple[Case, str, float]]) -> str:

@@ -6,6 +6,7 @@ from .benchmark import compare
 from .certificate import Certificate, certify
 from .demonstration import Demonstration
 from .diffeomorphism import Diffeomorphism, LocallyWeightedTranslations
+from .fidelity import FitWarning
 from .kernels import warmup
 from .methods.chebyshev import ChebyshevDS
 from .methods.tube import TubeDS
@@ -19,6 +20,7 @@ __all__ = [
     "Demonstration",
     "Diffeomorphism",
     "FitReport",
+    "FitWarning",
     "LatentDS",
     "LocallyWeightedTranslations",
     "StableDS",

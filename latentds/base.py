@@ -8,9 +8,12 @@ import inspect
 import json
 import math
 import os
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from contextvars import ContextVar
 from dataclasses import asdict, dataclass, replace
+from functools import wraps
 from typing import Any, ClassVar, TypeVar
 
 import torch
@@ -22,11 +25,12 @@ from .deploy.controller import Controller
 from .deploy.tables import FieldTables, field_tables
 from .diffeomorphism import Diffeomorphism
 from .dynamics import Frame, LatentDynamics
+from .fidelity import Excerpt, Fidelity, FitWarning, measure
 from .files import write_tensors
 from .integrate import integrate
 from .kernels.dispatch import no_active_transforms
 from .memory import Memo, tensors_of
-from .similarity import Similarity, check_rotation
+from .wrappers import Similarity, check_rotation
 
 FORMAT = 2
 """Of the files of systems; raised when they change so that another latentds would misread them."""
@@ -44,8 +48,10 @@ class FitReport:
         n_layers: layers of the diffeomorphism.
         seconds: wall time of the fit.
         history: loss per epoch, for methods that learn by gradient.
-        notes: what the user should know of this fit (early stop, divergence handled, choices made).
+        notes: what the user should know of this fit (early stop, divergence handled, choices made, what does not
+            follow the demonstration).
         learned_from: name and SHA-256 of each demonstration.
+        fidelity: how the fitted system follows what it was shown, measured after every fit, whatever the method.
         state: SHA-256 of the system's state after the fit, to the precision of float32; filled in by the system.
     """
 
@@ -55,6 +61,7 @@ class FitReport:
     history: tuple[float, ...] = ()
     notes: tuple[str, ...] = ()
     learned_from: tuple[tuple[str, str], ...] = ()
+    fidelity: Fidelity | None = None
     state: str = ""
 
 
@@ -63,6 +70,10 @@ class StableDS(nn.Module, ABC):
 
     A new method subclasses this, implements :meth:`fit`, :meth:`forward` and :meth:`lyapunov`, and certifies itself
     with :func:`latentds.testing.check_stable_ds`. An unfitted system is stable too.
+
+    Every ``fit`` is followed by a measurement that the method need not ask for: motions of the fitted system are held
+    against the demonstration (:mod:`latentds.fidelity`). The figures are in ``fit_report.fidelity``; what is off is in
+    ``fit_report.notes`` and in a :class:`~latentds.FitWarning`.
 
     Everything is computed in the module's dtype (float64 unless moved with ``.to``; float32 is the narrowest) and
     returned in the dtype of the input. Arrays are accepted where tensors are.
@@ -85,6 +96,12 @@ class StableDS(nn.Module, ABC):
         self.dim = whole_number(dim, "dim", at_least=1)
         self._fit_report = None
         self.register_buffer("attractor", torch.zeros(self.dim, dtype=torch.float64))
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        fit = inspect.getattr_static(cls, "fit")
+        if inspect.isfunction(fit) and not getattr(fit, "__isabstractmethod__", False) and not hasattr(fit, "measured"):
+            cls.fit = _measured(fit)  # type: ignore[method-assign]
 
     @property
     def fit_report(self) -> FitReport | None:
@@ -164,6 +181,12 @@ class StableDS(nn.Module, ABC):
             moved.similarity.get_buffer(name).copy_(torch.as_tensor(value))
         return moved
 
+    def excerpts(self) -> tuple[Excerpt, ...]:
+        """What the report of its fit keeps of the demonstrations, as this system is to follow them; () if nothing."""
+        report = self.fit_report
+        fidelity = report.fidelity if isinstance(report, FitReport) else None
+        return () if fidelity is None else fidelity.shown
+
     def surroundings(self, ball: Tensor) -> Tensor | None:
         """Where the motion was shown: points (m, n) for those of a unit ball, of which 0 is the attractor and the start
         lies at distance 1. None if the system does not know."""
@@ -171,6 +194,10 @@ class StableDS(nn.Module, ABC):
 
     def tables(self) -> FieldTables | None:
         """The velocity field as plain arrays, for controllers and exporters; None where it cannot be written so."""
+        return None
+
+    def latent_error(self, y0: Tensor, t: Tensor) -> Tensor | None:
+        """What rounding does to the map of a latent system, see :class:`LatentDS`; None for any other."""
         return None
 
     @property
@@ -274,6 +301,52 @@ def _vector(values: Any, like: Tensor, name: str) -> Tensor:
     return vector
 
 
+_UNDERWAY: ContextVar[tuple[int, ...]] = ContextVar("ids of the systems that are being fitted", default=())
+
+
+def _measured(fit: Callable[..., Any]) -> Callable[..., Any]:
+    """``fit`` as a method that holds the fitted system against what it was shown."""
+
+    @wraps(fit)
+    def measured_fit(self: StableDS, *args: Any, **kwargs: Any) -> Any:
+        return _fit(fit, self, args, kwargs)
+
+    measured_fit.measured = True  # type: ignore[attr-defined]
+    return measured_fit
+
+
+def _fit(fit: Callable[..., Any], ds: StableDS, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """Fit and measure: once where a fit calls the one that it overrides; told by the outermost of nested fits alone."""
+    underway = _UNDERWAY.get()
+    if id(ds) in underway:
+        return fit(ds, *args, **kwargs)
+    token = _UNDERWAY.set((*underway, id(ds)))
+    try:
+        fitted = fit(ds, *args, **kwargs)
+    finally:
+        _UNDERWAY.reset(token)
+    notes = _hold_against(ds, args[0] if args else kwargs.get("demonstration"))
+    if notes and not underway:
+        text = f"{type(ds).__name__} does not follow what it was shown: {'; '.join(notes)}"
+        warnings.warn(text, FitWarning, stacklevel=3)
+    return fitted
+
+
+def _hold_against(ds: StableDS, demonstration: Any) -> tuple[str, ...]:
+    """Put into the report how ``ds`` follows its demonstration; what is off."""
+    try:
+        fidelity = measure(ds, Excerpt.of_each(demonstrations_of(demonstration, ds.dim)))
+        notes = fidelity.notes
+    except Exception as error:  # a method's own rollout may raise anything; the fit itself is done and stays
+        fidelity, notes = None, (f"could not be measured, {type(error).__name__}: {error}",)
+    report = ds.fit_report
+    if isinstance(report, FitReport):
+        told = () if report.fidelity is None else report.fidelity.notes
+        before = tuple(note for note in report.notes if note not in told)
+        ds.fit_report = replace(report, fidelity=fidelity, notes=before + notes)
+    return notes
+
+
 class LatentDS(StableDS):
     """A stable system made of a diffeomorphism ψ (latent -> demonstration) and latent dynamics.
 
@@ -361,6 +434,23 @@ class LatentDS(StableDS):
         safe = torch.where(finite[..., None, None], jacobians, torch.eye(self.dim).to(jacobians))
         return torch.where(finite, torch.linalg.cond(safe), math.inf)
 
+    def latent_motion(self, y0: Tensor, t: Tensor) -> Tensor:
+        """Where ψ⁻¹ of the motion from ``y0`` is at times ``t``: (..., n), (T,) seconds -> (..., T, n)."""
+        return self.dynamics.flow(self.encode(y0), self._times(t), self.frame())
+
+    def latent_error(self, y0: Tensor, t: Tensor) -> Tensor:
+        """How far encode(decode(x)) comes back from x along the latent motion from ``y0``, in the length of its way.
+
+        Invertible on paper is not invertible in floats: where ψ nearly folds, rounding ψ(x) loses x.
+
+        Returns:
+            (..., n), (T,) seconds -> (..., T).
+        """
+        x, frame = self.latent_motion(y0, t), self.frame()
+        way = torch.linalg.vector_norm(x[..., 0, :] - frame.attractor, dim=-1, keepdim=True)
+        error: Tensor = torch.linalg.vector_norm(self.encode(self.decode(x)) - x, dim=-1) / way
+        return error
+
     def tables(self) -> FieldTables | None:
         if type(self).forward is not LatentDS.forward:
             return None  # a subclass whose velocity is another one must say itself how to write it
@@ -422,11 +512,21 @@ class MovedDS(StableDS):
 
     def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> MovedDS:
         before, after = self.ds.attractor.clone(), self.attractor
-        shown = [self.similarity.fetch_motion(one, before, after) for one in demonstrations_of(demonstration, self.dim)]
+        theirs = demonstrations_of(demonstration, self.dim)
+        shown = [self.similarity.fetch_motion(one, before, after) for one in theirs]
         self.ds.fit(shown[0] if isinstance(demonstration, Demonstration) else shown, progress=progress)
         with torch.no_grad():
             after.copy_(self.similarity.carry(self.ds.attractor, before, after))
+        if isinstance(report := self.fit_report, FitReport) and report.learned_from:
+            self.fit_report = replace(report, learned_from=tuple(one.fingerprint for one in theirs))
         return self
+
+    fit.measured = True  # type: ignore[attr-defined]  # the fit inside measures itself
+
+    def excerpts(self) -> tuple[Excerpt, ...]:
+        return tuple(
+            self.similarity.carry_excerpt(one, self.ds.attractor, self.attractor) for one in self.ds.excerpts()
+        )
 
     def forward(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
@@ -448,6 +548,9 @@ class MovedDS(StableDS):
     def surroundings(self, ball: Tensor) -> Tensor | None:
         inside = self.ds.surroundings(ball)
         return None if inside is None else self._outside(inside)
+
+    def latent_error(self, y0: Tensor, t: Tensor) -> Tensor | None:
+        return self.ds.latent_error(self._inside(y0), self.similarity.speed * self._times(t))
 
     def _inside(self, y: Tensor) -> Tensor:
         return self.similarity.fetch(y, self.ds.attractor, self.attractor)

@@ -15,7 +15,7 @@ from torch import nn
 from .arguments import whole_number
 from .cell import COLUMNS, Cell, Factory, Outcome, Protocol, build, evaluate, isolated_rng, several
 from .demonstration import Demonstration
-from .store import CellStore, fingerprint
+from .store import CellStore, UnreadableError, fingerprint
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -58,13 +58,14 @@ def compare(
         store: a file that keeps every finished cell (:class:`latentds.store.CellStore`), so that a run that was
             interrupted goes on where it stopped. A cell is known by its label, the method's settings and code, the
             demonstrations and judges, the seed and the protocol: if one changes, it is computed anew. Failed cells are
-            not kept.
+            not kept, nor are those of a method whose code or settings cannot be read; a warning names it.
 
     Returns:
         One row per method, demonstration, seed and start:
 
         * ``status``: "ok", "diverged" (the rollout holds NaN or inf) or "failed" (``error`` then says what was raised);
           their scores are NaN.
+        * ``follows``: whether the fit measured itself and found nothing off (:mod:`latentds.fidelity`); one per cell.
         * ``dtw``, ``dtw_fast``: exact and FastDTW (radius 1) distance to the demonstration, raw sums; ``…_per_point``
           divided by ``n_points``. ``frechet``, ``endpoint_error``, ``path_length_ratio``: see :mod:`latentds.metrics`.
         * ``converged``: after ``HORIZON`` durations the motion is within ``CONVERGED`` of the demonstration's size from
@@ -136,7 +137,7 @@ def _run(
         _bar(len(cells)) if progress else nullcontext(lambda outcome: None) as advance,
         nullcontext() if store is None else CellStore(store) as kept,
     ):
-        keys = {} if kept is None else {cell.name: _key(cell, protocol) for cell in cells}
+        keys = {} if kept is None else _keys(cells, protocol)
         todo = []
         for cell in cells:
             key = keys.get(cell.name)
@@ -168,6 +169,20 @@ def _spread(cells: list[Cell], protocol: Protocol, n_jobs: int | None) -> Genera
     step = max(1, len(cells) if streams else joblib.effective_n_jobs(-1 if n_jobs is None else n_jobs))
     for first in range(0, len(cells), step):
         yield from parallel(joblib.delayed(evaluate)(cell, protocol) for cell in cells[first : first + step])
+
+
+def _keys(cells: Sequence[Cell], protocol: Protocol) -> dict[tuple[str, str, int], str | None]:
+    """What finished cells are known by; warns once of each method that no key can stand for."""
+    keys, hidden = {}, {}
+    for cell in cells:
+        try:
+            keys[cell.name] = _key(cell, protocol)
+        except UnreadableError as error:
+            hidden[cell.method] = str(error)
+    for method, reason in hidden.items():
+        told = f"store: {method!r} is not kept but computed by every run: {reason}"
+        warnings.warn(told, RuntimeWarning, stacklevel=2)
+    return keys
 
 
 def _key(cell: Cell, protocol: Protocol) -> str | None:

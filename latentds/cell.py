@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+import signal
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -19,6 +22,7 @@ from . import kernels, metrics
 from .arguments import number_in, whole_number
 from .base import StableDS
 from .demonstration import Demonstration
+from .fidelity import FitWarning
 
 Factory = Callable[[int], StableDS]
 
@@ -33,7 +37,7 @@ SCORES = (
     "dtw", "dtw_fast", "dtw_per_point", "dtw_fast_per_point", "frechet", "endpoint_error", "path_length_ratio",
     "velocity_rmse", "velocity_cosine", "mse", "n_parameters", "n_layers", "fit_seconds", "rollout_seconds",
 )  # fmt: skip
-COLUMNS = ("method", "demonstration", "seed", "start", "status", "error", "converged", *SCORES)
+COLUMNS = ("method", "demonstration", "seed", "start", "status", "error", "follows", "converged", *SCORES)
 
 
 @dataclass(frozen=True)
@@ -143,11 +147,40 @@ class Outcome:
     paths: NDArray[np.float64]
 
 
+@contextmanager
+def interrupts_kept() -> Iterator[None]:
+    """Ctrl-C in this block ends it with KeyboardInterrupt, whatever became of it there.
+
+    What is raised while compiled code calls back into Python is dropped or comes out as another error: an interrupt
+    while numba loads or compiles a kernel as "RuntimeError: no compiled object yet", or not at all.
+    """
+    usual = signal.default_int_handler
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not usual:
+        yield  # Ctrl-C is heard elsewhere
+        return
+    pressed = False
+
+    def handler(number: int, frame: FrameType | None) -> None:
+        nonlocal pressed
+        pressed = True
+        usual(number, frame)
+
+    signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, usual)
+        if pressed:
+            raise KeyboardInterrupt
+
+
+@interrupts_kept()
 def evaluate(cell: Cell, protocol: Protocol) -> Outcome:
-    """Fit, roll out and score one cell. Whatever the method raises is told in its rows."""
+    """Fit, roll out and score one cell. Whatever the method raises is told in its rows; Ctrl-C is no failure of it."""
     shown, judges, share = cell.shown, cell.judges, protocol.n_starts + 1
     paths = np.full((len(judges), share, protocol.n_points, shown[0].dim), np.nan)
     converged = np.zeros((len(judges), share), dtype=bool)
+    follows = False
     facts: dict[str, Any] = dict.fromkeys(SCORES, math.nan)
     of_judge: list[dict[str, float]] = [{} for _ in judges]
     error = ""
@@ -156,8 +189,11 @@ def evaluate(cell: Cell, protocol: Protocol) -> Outcome:
             ds = build(cell)
             kernels.warmup([ds.dim])  # compiling is nobody's fitting time
             began = time.perf_counter()
-            ds.fit(shown[0] if len(shown) == 1 else list(shown))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", FitWarning)  # the rows tell it
+                ds.fit(shown[0] if len(shown) == 1 else list(shown))
             facts["fit_seconds"] = time.perf_counter() - began
+            follows = bool(ds.fit_report and ds.fit_report.fidelity and ds.fit_report.fidelity.follows)
             of_judge = [_velocity_scores(ds, judge) for judge in judges]
             more = dict(cell.measure(ds, cell)) if cell.measure else {}
             if taken := more.keys() & {*COLUMNS, "judge"}:
@@ -177,7 +213,12 @@ def evaluate(cell: Cell, protocol: Protocol) -> Outcome:
         error = f"{type(raised).__name__}: {raised}"
     rows = [
         {"method": cell.method, "demonstration": cell.demonstration, "seed": cell.seed, "start": share * i + k}
-        | {"status": _status(error, path), "error": error, "converged": bool(converged[i, k])}
+        | {
+            "status": _status(error, path),
+            "error": error,
+            "follows": follows and not error,
+            "converged": bool(converged[i, k]),
+        }
         | {"judge": judge.name}
         | facts
         | of_judge[i]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -13,8 +13,14 @@ from torch import Tensor
 
 from .arguments import real_array, whole_number
 from .base import LatentDS, MovedDS, StableDS
+from .fidelity import ROUNDING, STARTS, Excerpt, measure
 
 Verdict = Literal["proven", "not falsified", "falsified"]
+
+HORIZON = 100.0
+"""Durations within which every motion must arrive: far beyond what any pause or far start of a sound fit costs."""
+N_TIMES = 101
+"""Times of one duration at which motions are looked at."""
 
 
 @dataclass(frozen=True)
@@ -23,8 +29,8 @@ class Line:
 
     Attributes:
         claim: what is claimed.
-        verdict: "proven" by construction (checked on the parameters, exact arithmetic assumed), "not falsified" by a
-            search, or "falsified".
+        verdict: "proven" by construction (all that the proof rests on was checked on the very numbers that run; exact
+            arithmetic assumed), "not falsified" by a search, or "falsified".
         tries: points, starts or layers that were tried.
         worst: the number nearest to breaking the claim, or the largest found after it broke; see ``detail``.
         detail: what ``worst`` is.
@@ -87,8 +93,10 @@ class Certificate:
 def certify(ds: StableDS, region: Any = None, *, n_samples: int = 1000, seed: int = 0) -> Certificate:
     """State what holds of a system by construction, and try to falsify the rest.
 
-    Searched for, in the region: an attractor that moves, an inverse or a Jacobian that is off, folds, equilibria other
-    than the attractor, points at which V does not decrease, motions that do not arrive.
+    Searched for, in the region and where motions from it run: an attractor that moves, an inverse or a Jacobian that is
+    off, folds, equilibria other than the attractor, points at which V does not decrease, motions along which it rises,
+    that differ from their two halves or that do not arrive. A system that was fitted is also held against what its
+    report keeps of the demonstrations, as after the fit (:mod:`latentds.fidelity`), with the numbers that it has now.
 
     Args:
         ds: any system, fitted or not; it is left as it is.
@@ -119,34 +127,42 @@ class _Search:
         self.goal = ds.attractor.detach()
         self.size = float((box[1] - box[0]).max())
         self.tolerance = torch.finfo(self.goal.dtype).eps ** 0.4  # 5e-7 in float64
+        self.rounding = max(ROUNDING, self.tolerance)
         inside = box[0] + (box[1] - box[0]) * self._uniform(n_samples - n_samples // 4, ds.dim)
         radii = self.size * 10 ** (-3 * self._uniform(n_samples // 4, 1))
         near = self.goal.cpu() + radii * self._directions(n_samples // 4)
         points = torch.cat([inside.to(self.box), near.to(self.box).clamp(self.box[0], self.box[1])])
-        away = torch.linalg.vector_norm(points - self.goal, dim=-1) > 1e-4 * self.size
-        self.points = points[away]
+        at_goal = torch.linalg.vector_norm(points - self.goal, dim=-1) <= 1e-4 * self.size
+        self.points = points[~at_goal]
         with torch.no_grad():
             self.velocity = ds(self.points)
             speed = torch.linalg.vector_norm(self.velocity, dim=-1)
         finite = speed[torch.isfinite(speed)]
         self.speed = max(float(finite.median()) if len(finite) else 0.0, torch.finfo(self.goal.dtype).tiny)
-        self.duration = self.size / self.speed
+        self.shown = _shown(ds)
+        self.duration = self.shown[0].duration if self.shown else min(self.size / self.speed, 1e30)
+        demonstrated = torch.tensor([one.path[0] for one in self.shown], dtype=torch.float64).reshape(-1, ds.dim)
+        some = self.points[:: max(1, len(self.points) // 32)]
+        self.starts = torch.cat([demonstrated.to(self.points), some])
+        self.times = torch.linspace(0, self.duration, N_TIMES, dtype=torch.float64).to(self.points.device)
 
     def lines(self) -> list[Line]:
-        found = [self._finite()]
-        inside = self.ds
+        found, inside = [self._finite()], self.ds
         while isinstance(inside, MovedDS):
             inside = inside.ds
         if isinstance(inside, LatentDS):
             found += self._invertibility(inside)
         if isinstance(self.ds, LatentDS):
-            found += self._rate(self.ds)
+            found += [self._rate(self.ds)]
         found += [self._attractor()]
         if found[0].verdict == "falsified":
             return found
+        with torch.no_grad():
+            self.paths = self.ds.rollout(self.starts, self.times)
         if isinstance(self.ds, LatentDS):
-            found += [self._round_trip(self.ds), self._jacobian(self.ds), self._conditioning(self.ds)]
-        return [*found, self._equilibria(), self._descent(), self._convergence()]
+            found += self._maps(self.ds)
+        found += [self._equilibria(), self._positive(), self._descent(), *self._motions(), self._convergence()]
+        return [*found, self._follows()] if self.shown else found
 
     def _finite(self) -> Line:
         broken = ~torch.isfinite(self.velocity).all(-1)
@@ -156,16 +172,30 @@ class _Search:
         told = ds.diffeomorphism.invertibility()
         return [] if told is None else [_settled(told.claim, told.n_checked, told.margin, told.detail, told.fold)]
 
-    def _rate(self, ds: LatentDS) -> list[Line]:
-        with torch.no_grad():
-            frame = ds.frame()
-            reach = torch.linalg.vector_norm(ds.encode(self.points) - frame.attractor, dim=-1)
-            radius = float(reach[torch.isfinite(reach)].max()) if bool(torch.isfinite(reach).any()) else 1.0
-            rate = ds.dynamics.convergence_rate_bound(radius, frame)
-        if rate is None:
-            return []
+    def _rate(self, ds: LatentDS) -> Line:
+        """Proven in the ball around x* that holds all of the region, or all samples if ψ knows no such ball.
+
+        Where the numbers break what the proof rests on, samples have to do, and the places that their motions pass.
+        """
         claim = "latent motions approach the goal, -V̇/2V >= rate > 0"
-        return [_settled(claim, 1, rate, "least rate in the region, per second:")]
+        with torch.no_grad():
+            frame, x = ds.frame(), ds.encode(self.points)
+            goal = frame.attractor
+            box, where = ds.diffeomorphism.inverse_box(self.box[0], self.box[1]), "in the region"
+            if box is None:
+                farthest, where = (x - goal).nan_to_num(), "where samples lie"
+            else:
+                farthest = torch.maximum((box[0] - goal).abs(), (box[1] - goal).abs()).unsqueeze(0)
+            radius = float(torch.linalg.vector_norm(farthest, dim=-1).max())
+            bound = ds.dynamics.convergence_rate_bound(radius, frame)
+            if bound is not None and 0 < bound < math.inf:
+                return Line(claim, "proven", 1, bound, f"least rate {where}, per second:")
+            x = torch.cat([x, ds.latent_motion(self.starts, self.times).flatten(0, 1)])
+            x = x[(x != goal).any(-1)]
+            y, offset = ds.decode(x), x - goal
+            rates = -(ds.dynamics(x, y, frame) * offset).sum(-1) / offset.square().sum(-1)
+        line = self._judge(claim, -rates, -torch.finfo(rates.dtype).tiny, "least rate of samples, per second:", y)
+        return replace(line, worst=-line.worst)
 
     def _attractor(self) -> Line:
         with torch.no_grad():
@@ -177,10 +207,22 @@ class _Search:
         worst = torch.tensor(errors).nan_to_num(nan=math.inf).amax().expand(1)
         return self._judge("the attractor rests", worst, self.tolerance, "relative error", self.goal.unsqueeze(0))
 
-    def _round_trip(self, ds: LatentDS) -> Line:
+    def _maps(self, ds: LatentDS) -> list[Line]:
+        """ψ, its inverse and its Jacobian, at the samples and where motions run."""
+        passed = self.paths.flatten(0, 1)
+        points = torch.cat([self.points, passed])
         with torch.no_grad():
-            error = torch.linalg.vector_norm(ds.decode(ds.encode(self.points)) - self.points, dim=-1) / self.size
-        return self._judge("decode inverts encode", error, self.tolerance, "relative error", self.points)
+            x = ds.encode(points)
+            there = torch.linalg.vector_norm(ds.decode(x) - points, dim=-1) / self.size
+            # In units of the longest way to the goal: of a demonstration, if there is one.
+            way = torch.linalg.vector_norm(ds.encode(self.starts) - ds.frame().attractor, dim=-1, keepdim=True)
+            back = ds.latent_error(self.starts, self.times) * way / way[: len(self.shown) or None].max()
+        return [
+            self._judge("decode inverts encode", there, self.tolerance, "relative error", points),
+            self._judge("encode inverts decode", back.flatten(), self.rounding, "error in latent lengths", passed),
+            self._jacobian(ds),
+            self._conditioning(ds, x, points),
+        ]
 
     def _jacobian(self, ds: LatentDS) -> Line:
         points = self.points[:: max(1, len(self.points) // 64)]
@@ -194,16 +236,15 @@ class _Search:
         error = torch.linalg.matrix_norm(closed - wanted) / torch.linalg.matrix_norm(wanted)
         return self._judge("the closed-form Jacobian is autograd's", error, self.tolerance, "relative error", points)
 
-    def _conditioning(self, ds: LatentDS) -> Line:
+    def _conditioning(self, ds: LatentDS, x: Tensor, points: Tensor) -> Line:
         with torch.no_grad():
-            jacobians = ds.jacobian(ds.encode(self.points)).to(torch.float64)
-            condition = torch.linalg.cond(jacobians).nan_to_num(nan=math.inf)
-            signs = torch.linalg.slogdet(jacobians)[0]
+            condition = ds.condition_number(x)
+            signs = torch.linalg.slogdet(ds.jacobian(x).to(torch.float64))[0]
         folded = signs != signs.median()
         limit = 1 / torch.finfo(self.goal.dtype).eps
         badness = torch.where(folded, math.inf, condition)
         claim = "ψ neither folds nor flattens space"
-        return self._judge(claim, badness, limit, "cond(J)", self.points)
+        return self._judge(claim, badness, limit, "cond(J)", points)
 
     def _equilibria(self) -> Line:
         """Damped Newton steps on f(y)/‖y - y*‖ = 0; dividing takes the attractor itself away from the solver."""
@@ -238,6 +279,32 @@ class _Search:
         durations, claim = 1 / relative[away], "no equilibrium but the attractor"
         return self._judge(claim, durations, 1e10, "largest slowness", every[away])
 
+    def _positive(self) -> Line:
+        """A V that is flat, or that jumps at the attractor, proves nothing, whatever its slope."""
+        distance = max(1e-7 * self.size, 8 * torch.finfo(self.goal.dtype).eps * float(self.goal.abs().max()))
+        beside = self.goal + distance * self._directions(64).to(self.goal)
+        with torch.no_grad():
+            high = self.ds.lyapunov(self.points)
+            low = self.ds.lyapunov(torch.cat([self.goal.unsqueeze(0), beside])).abs() / high.max()
+        badness = torch.cat([torch.where(high > 0, 0.0, math.inf), low])
+        points = torch.cat([self.points, self.goal.unsqueeze(0), beside])
+        claim, detail = "V is above 0, and falls to 0 at the attractor", "V beside it over the largest"
+        return self._judge(claim, badness, 1e-2, detail, points)
+
+    def _motions(self) -> list[Line]:
+        """What holds of every flow: V falls along it, and half a motion and half a motion are the motion."""
+        with torch.no_grad():
+            energy = self.ds.lyapunov(self.paths)
+            rise = energy.diff(dim=-1) / energy[:, :1]
+            middle = N_TIMES // 2
+            anew = self.ds.rollout(self.paths[:, middle], self.times[middle:])
+            apart = torch.linalg.vector_norm(anew - self.paths[:, middle:], dim=-1).amax(-1) / self.size
+        before = self.paths[:, :-1].flatten(0, 1)
+        return [
+            self._judge("V falls along motions", rise.flatten(), self.tolerance, "largest rise over V(0)", before),
+            self._judge("a motion is its two halves", apart, self.rounding, "largest distance", self.starts),
+        ]
+
     def _descent(self) -> Line:
         """Sampling, then gradient ascent on V̇/V from the worst points, by differences."""
         relative, cosine = self._slopes(self.points)
@@ -256,32 +323,34 @@ class _Search:
         points = torch.cat(every)
         away = torch.linalg.vector_norm(points - self.goal, dim=-1) > 1e-4 * self.size
         claim, detail = "V decreases, V̇ < 0", "largest cosine of ∇V and f"
-        return self._judge(claim, torch.cat(cosines)[away], 1e-3 * self.tolerance, detail, points[away])
+        return self._judge(claim, torch.cat(cosines)[away], -torch.finfo(points.dtype).tiny, detail, points[away])
 
     def _slopes(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """V̇/V, and the cosine of ∇V and f: both (B,)."""
+        """V̇/V, and the cosine of ∇V and f, NaN where one of them is 0: both (B,)."""
         y = points.detach().clone().requires_grad_()
-        energy = self.ds.lyapunov(y)
+        energy = self.ds.lyapunov(y) + 0 * y.sum(-1)  # a constant V has a gradient too
         (uphill,) = torch.autograd.grad(energy.sum(), y)
         with torch.no_grad():
             velocity = self.ds(points)
         slope = (uphill * velocity).sum(-1)
-        steepest = torch.linalg.vector_norm(uphill, dim=-1) * torch.linalg.vector_norm(velocity, dim=-1)
         relative = torch.where(torch.isfinite(slope), slope / energy.detach(), math.inf)
-        return relative, torch.where(steepest == 0, 0.0, slope / steepest)
+        uphill, ahead = (v / torch.linalg.vector_norm(v, dim=-1, keepdim=True) for v in (uphill, velocity))
+        return relative, (uphill * ahead).sum(-1)
 
     def _convergence(self) -> Line:
-        starts = self.points[:: max(1, len(self.points) // 64)]
-        state, horizon = starts, self.duration
-        left = torch.full_like(starts[:, 0], math.inf)
-        for _ in range(40):  # twice the time at each stage
-            with torch.no_grad():
-                state = self.ds.rollout(state, torch.tensor([0.0, horizon], dtype=torch.float64))[:, -1]
-            left = torch.linalg.vector_norm(state - self.goal, dim=-1) / self.size
-            if bool((left < 1e-3).all()) or not bool(torch.isfinite(left).all()):
-                break
-            horizon *= 2
-        return self._judge("every motion arrives", left, 1e-3, "largest distance left", starts)
+        times = torch.tensor([0.0, HORIZON * self.duration], dtype=torch.float64).to(self.times.device)
+        with torch.no_grad():
+            left = torch.linalg.vector_norm(self.ds.rollout(self.starts, times)[:, -1] - self.goal, dim=-1) / self.size
+        claim = f"every motion arrives within {HORIZON:g} durations"
+        return self._judge(claim, left, 1e-3, "largest distance left", self.starts)
+
+    def _follows(self) -> Line:
+        """Measured again, on the numbers as they are now, against what the report keeps of the demonstrations."""
+        fidelity = measure(self.ds, self.shown)
+        badness, told = max(fidelity.findings)
+        verdict: Verdict = "not falsified" if fidelity.follows else "falsified"
+        tries = len(self.shown) + STARTS
+        return Line("follows its demonstration", verdict, tries, badness, f"{told}; share of the limit")
 
     def _judge(self, claim: str, badness: Tensor, limit: float, detail: str, points: Tensor) -> Line:
         """Falsified where ``badness`` (B,) is above ``limit``, or NaN, at one of the ``points`` (B, n)."""
@@ -308,6 +377,14 @@ def _settled(
     return Line(claim, "proven" if holds else "falsified", tries, worst, detail, counterexample)
 
 
+def _shown(ds: StableDS) -> tuple[Excerpt, ...]:
+    """What the report of its fit keeps of the demonstrations."""
+    shown = ds.excerpts()
+    if any(len(one.path[0]) != ds.dim for one in shown):
+        raise ValueError(f"ds: expected a fit_report that keeps demonstrations of dimension {ds.dim}, got another")
+    return shown
+
+
 def _region(ds: StableDS, region: Any, generator: torch.Generator) -> Tensor:
     if region is not None:
         corners = real_array(region, "region")
@@ -323,6 +400,10 @@ def _region(ds: StableDS, region: Any, generator: torch.Generator) -> Tensor:
         raise ValueError(f"region: expected (2, {ds.dim}) corners, as {type(ds).__name__} implies none, got None")
     points = torch.cat([around, ds.attractor.unsqueeze(0)]).detach().cpu().double()
     points = points[torch.isfinite(points).all(-1)]
+    if not bool((points != points[:1]).any()):
+        raise ValueError(
+            f"region: expected (2, {ds.dim}) corners, as the latent ball of {type(ds).__name__} implies none, got None"
+        )
     low, high = points.amin(0), points.amax(0)
     margin = (0.25 * (high - low)).clamp(min=0.01 * float((high - low).max()))
     return torch.stack([low - margin, high + margin])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -210,6 +211,11 @@ def demonstrations_of(demonstration: Any, dim: int) -> list[Demonstration]:
         if item.dim != dim:
             raise ValueError(f"demonstration: expected dimension {dim}, got {item.dim} ({item!r})")
     return list(found)
+
+
+def jitter(positions: NDArray[np.float64]) -> float:
+    """Length of the noise in a recording (N, n), read off its second differences: in the units of the positions."""
+    return float(np.median(np.linalg.norm(np.diff(positions, 2, axis=0), axis=1)) / math.sqrt(6))
 
 
 def goal_apart(shown: Demonstration) -> float:

@@ -67,6 +67,10 @@ class Diffeomorphism(nn.Module, ABC):
         """What proves this map invertible for the parameters that it has now; None if nothing does."""
         return None
 
+    def inverse_box(self, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor] | None:
+        """A box that holds ψ⁻¹ of all points of the box from ``low`` to ``high``, all (n,); None if none is known."""
+        return None
+
     def layer_table(self) -> NDArray[np.float64] | None:
         """The map as the velocity kernel reads it, a row (c, v, ρ², ρ²‖v‖²) per layer (M, 2n+2); None if it cannot."""
         return None
@@ -228,6 +232,12 @@ class LocallyWeightedTranslations(Diffeomorphism):
         fold = None if margins[worst] > 0 else self._fold(worst)
         claim, detail = "every layer is invertible, ρ‖v‖√(2/e) < 1", "smallest margin"
         return Invertibility(claim, len(margins), float(margins[worst]), detail, fold)
+
+    @torch.no_grad()
+    def inverse_box(self, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+        # Each layer moves a point by a share of its v between 0 and 1.
+        v = self.directions
+        return low - v.clamp(min=0).sum(0), high - v.clamp(max=0).sum(0)
 
     def layer_table(self) -> NDArray[np.float64] | None:
         if type(self) is not LocallyWeightedTranslations:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
@@ -51,7 +52,10 @@ class LatentDynamics(nn.Module, ABC):
         return (x - frame.attractor).square().sum(-1)
 
     def convergence_rate_bound(self, radius: float, frame: Frame) -> float | None:
-        """A lower bound on -V̇/(2V) within ``radius`` of x*, per second, that holds by construction; None if unknown."""
+        """A lower bound on -V̇/(2V) within ``radius`` of x*, per second, that holds by construction; None if unknown.
+
+        It is taken from the numbers that run; where they break what it rests on, it is not above 0.
+        """
         return None
 
     def tables(self, frame: Frame) -> tuple[Array, Array, Array] | None:
@@ -79,7 +83,8 @@ class RayDynamics(LatentDynamics):
         return frame.attractor + _shrink(self.law, _off_zero(offset / frame.length), t) * offset
 
     def convergence_rate_bound(self, radius: float, frame: Frame) -> float:
-        return self.law.convergence_rate_bound(radius / float(frame.length))
+        length = float(frame.length)
+        return self.law.convergence_rate_bound(radius / length) if length > 0 else -math.inf
 
     def tables(self, frame: Frame) -> tuple[Array, Array, Array] | None:
         law = self.law.table() if type(self) is RayDynamics else None
@@ -110,7 +115,12 @@ class TubeDynamics(LatentDynamics):
         return frame.attractor + frame.length * (left + _shrink(self.transverse_law, _off_zero(across), t) * across)
 
     def convergence_rate_bound(self, radius: float, frame: Frame) -> float:
-        reach = radius / float(frame.length)
+        length, dtype = float(frame.length), frame.axis.dtype
+        norm = float(torch.linalg.vector_norm(frame.axis.to(torch.float64)))
+        # by an axis that is longer, what lies along it would also be pushed back
+        if not (length > 0 and (norm == 0 or abs(norm - 1) <= 8 * torch.finfo(dtype).eps)):
+            return -math.inf
+        reach = radius / length
         return min(self.law.convergence_rate_bound(reach), self.transverse_law.convergence_rate_bound(reach))
 
     def phase(self, x: Tensor, frame: Frame) -> Tensor:

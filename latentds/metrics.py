@@ -10,11 +10,10 @@ import math
 from typing import Any
 
 import numpy as np
-import torch
 from fastdtw import fastdtw
 from numpy.typing import NDArray
 
-from .arguments import real_array, whole_number
+from .arguments import number_in, real_array, whole_number
 from .kernels.compiling import cached
 
 Array = NDArray[np.float64]
@@ -80,16 +79,29 @@ def endpoint_error(path: Any, reference: Any) -> float:
     return float(np.linalg.norm(a[-1] - b[-1])) if _finite(a, b) else NAN
 
 
-def path_length_ratio(path: Any, reference: Any) -> float:
+def path_length_ratio(path: Any, reference: Any, ruler: float = 0.0) -> float:
     """Length of the path over that of the reference, (N, n) and (M, n): far below 1 gives a shortcut away.
 
-    NaN where the reference does not move.
+    NaN where the reference does not move. Steps up to ``ruler`` (units of the positions, >= 0) from the last point
+    counted are left out, in both, so that noise does not count as way.
     """
     a, b = _pair(path, reference)
+    number_in(ruler, "ruler", 0, math.inf, ends="[)")
     if not _finite(a, b):
         return NAN
-    travelled, shown = (float(np.linalg.norm(np.diff(p, axis=0), axis=1).sum()) for p in (a, b))
+    travelled, shown = path_length(a, ruler), path_length(b, ruler)
     return travelled / shown if shown > 0 else NAN
+
+
+def path_length(path: Array, ruler: float = 0.0) -> float:
+    """Length of a path (N, n) from the first point to the last, by steps longer than ``ruler``."""
+    here, *rest = path.tolist()
+    total = 0.0
+    for there in rest:
+        step = math.dist(here, there)
+        if step > ruler:
+            total, here = total + step, there
+    return total + math.dist(here, path[-1].tolist())
 
 
 def mse(values: Any, reference: Any) -> float:
@@ -118,22 +130,6 @@ def velocity_cosine(velocities: Any, reference: Any) -> float:
         return NAN
     along = np.einsum("ij,ij->i", a / np.where(speeds > 0, speeds, 1)[:, None], b)[moving]
     return float((along / shown[moving]).mean())
-
-
-def path_condition(jacobians: Any) -> float:
-    """Largest condition number (spectral) of the Jacobians of a map along a path, (..., n, n).
-
-    How far the map is from an isometry: 1 for one; inf where it flattens space, or holds NaN or inf.
-
-    Raises:
-        ValueError: if the argument is no such array.
-    """
-    matrices = real_array(jacobians, "jacobians")
-    if matrices.ndim < 2 or matrices.shape[-1] != matrices.shape[-2] or matrices.size == 0:
-        raise ValueError(f"jacobians: expected shape (..., n, n) with n >= 1, got {matrices.shape}")
-    if not np.isfinite(matrices).all():
-        return math.inf
-    return float(torch.linalg.cond(torch.from_numpy(matrices)).nan_to_num(nan=math.inf).max())
 
 
 def _pair(path: Any, reference: Any, *, same_length: bool = False) -> tuple[Array, Array]:

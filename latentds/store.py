@@ -53,13 +53,16 @@ class CellStore:
             self._connection = sqlite3.connect(self.path, timeout=60, isolation_level=None)
         except sqlite3.DatabaseError as error:
             raise self._refusal(error) from None
-        ours = self._execute("PRAGMA application_id")[0][0] == _APPLICATION
-        if not ours and self._execute("SELECT 1 FROM sqlite_master"):
+        # Asked again after its tables were seen: another process that makes the file sets the number first.
+        if not self._is_ours() and self._execute("SELECT 1 FROM sqlite_master") and not self._is_ours():
             raise self._refusal("a database of another kind")
         self._execute("PRAGMA journal_mode = WAL")
         self._execute(f"PRAGMA application_id = {_APPLICATION}")
         self._execute(_SCHEMA)
         self._execute("SELECT key, method, demonstration, seed, rows, paths, digest FROM cells LIMIT 0")
+
+    def _is_ours(self) -> bool:
+        return bool(self._execute("PRAGMA application_id")[0][0] == _APPLICATION)
 
     def _execute(self, command: str, values: tuple[Any, ...] = ()) -> list[Any]:
         try:
@@ -184,7 +187,7 @@ class _Reading:
 
     def _children(self, thing: Any) -> list[Any]:
         if isinstance(thing, CodeType):
-            return [getattr(thing, name, None) for name in _CODE]
+            return [_bytecode(thing)]
         if isinstance(thing, CellType):
             try:
                 return [thing.cell_contents]
@@ -265,6 +268,14 @@ class _Reading:
         return bool(folders) or (name or "").partition(".")[0] in sys.stdlib_module_names
 
 
+@cache
+def _bytecode(code: CodeType) -> bytes:
+    reading = _Reading()
+    reading.add([getattr(code, name, None) for name in _CODE], ())
+    return reading.digest.digest()
+
+
+@cache
 def _globals(code: CodeType) -> set[str]:
     """Names that a function, and those nested in it, look up in their module."""
     inner = [_globals(part) for part in code.co_consts if isinstance(part, CodeType)]

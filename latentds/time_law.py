@@ -38,7 +38,7 @@ class TimeLaw(nn.Module, ABC):
 
     @abstractmethod
     def convergence_rate_bound(self, reach: float) -> float:
-        """The least h(s)/s over 0 < s <= ``reach``, per second."""
+        """The least h(s)/s over 0 < s <= ``reach``, per second; not above 0 if the numbers make no law."""
 
     def table(self) -> NDArray[np.float64] | None:
         """The law as compiled code reads it, (2, m): knots and speeds, or the knot -1 and ω; None if it cannot."""
@@ -180,6 +180,10 @@ class PiecewiseLinearLaw(TimeLaw):
         return torch.where(index == 0, tail, inside)
 
     def convergence_rate_bound(self, reach: float) -> float:
+        try:
+            _check_knots(self.knots, self.speeds)  # whoever wrote them after the constructor did
+        except ValueError:
+            return -math.inf
         # h(s)/s is monotone between two knots
         ends = torch.cat([self.knots[self.knots < reach], self.knots.new_tensor([reach])])
         return float((self.speed(ends) / ends).min())

@@ -1,6 +1,10 @@
 """The comparison: shared starts, cells that do not disturb each other, failures told instead of raised."""
 
+import ctypes
 import math
+import signal
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import joblib
 import numpy as np
@@ -207,6 +211,16 @@ def test_a_rollout_that_diverges_is_told_start_by_start():
     assert list(rows["dtw"].isna()) == [False, True, False, False]
 
 
+def test_rows_tell_what_follows_and_nothing_else_does():
+    methods = {"FDM": lambda dim: FDM(dim, n_layers=60), "straight": Straight, "explosive": Explosive}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rows = compare(methods, SPIRAL, **QUICK)
+    assert rows["follows"].dtype == bool
+    assert rows.groupby("method")["follows"].mean().to_dict() == {"FDM": 1, "straight": 0, "explosive": 0}
+    assert set(rows[rows["method"] == "straight"]["status"]) == {"ok"}
+
+
 @pytest.mark.parametrize("method", [Lost, Slow])
 def test_converged_wants_the_goal_in_time(method):
     assert not compare({"m": method}, SPIRAL, **QUICK)["converged"].any()
@@ -390,3 +404,55 @@ def test_a_cell_names_what_is_wrong(name):
 def test_cells_that_are_alike_are_refused():
     with pytest.raises(ValueError, match=r"^cells: expected each only once"):
         run([Cell("a", Straight, SPIRAL), Cell("a", Slow, SPIRAL)])
+
+
+@ctypes.CFUNCTYPE(None)
+def ctrl_c():
+    """Within a callback from compiled code, where Python drops the KeyboardInterrupt."""
+    signal.raise_signal(signal.SIGINT)
+
+
+class GoesOn(Straight):
+    def fit(self, demonstration, *, progress=False):
+        ctrl_c()
+        return super().fit(demonstration)
+
+
+class Stumbles(Straight):
+    def fit(self, demonstration, *, progress=False):
+        ctrl_c()
+        raise RuntimeError("no compiled object yet")
+
+
+class Raises(Straight):
+    def fit(self, demonstration, *, progress=False):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt as interrupt:
+            raise SystemError("returned a result with an exception set") from interrupt
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("method", [GoesOn, Stumbles, Raises])
+def test_ctrl_c_is_no_failure_of_the_method_that_it_hits(method):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            compare({"first": method, "second": Straight}, SPIRAL, **QUICK)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_who_hears_ctrl_c_otherwise_still_does():
+    heard = []
+    before = signal.signal(signal.SIGINT, lambda *_: heard.append(True))
+    try:
+        rows = compare({"m": GoesOn}, SPIRAL, **QUICK)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert heard == [True]
+    assert (rows["status"] == "ok").all()
+    with ThreadPoolExecutor(1) as pool:  # where no handler can be set
+        (outcome,) = pool.submit(lambda: list(run([Cell("m", Straight, SPIRAL)], n_jobs=1))).result()
+    assert outcome.rows[0]["status"] == "ok"

@@ -155,23 +155,3 @@ def test_exact_dtw_is_faster_than_the_approximation():
 
     metrics.dtw(path, other)
     assert best(metrics.dtw) < best(metrics.fast_dtw)
-
-
-def test_condition_of_a_map_that_stretches(draw):
-    """Rotations change nothing; the ratio of the stretches is what counts, the worst along the path."""
-    turns = torch.linalg.qr(torch.randn(5, 3, 3, generator=draw, dtype=torch.float64))[0]
-    stretch = torch.diag_embed(torch.tensor([[1.0, 1, 1], [2, 1, 1], [6, 3, 1], [1, 1, 4], [5, 5, 5]])).double()
-    assert metrics.path_condition(turns @ stretch @ turns.mT) == pytest.approx(6)
-    assert metrics.path_condition(turns[0].float()) == pytest.approx(1)
-    assert metrics.path_condition((turns @ stretch * 1e-3).numpy()) == pytest.approx(6)
-
-
-def test_condition_of_a_map_that_breaks():
-    assert metrics.path_condition(np.stack([np.eye(2), np.zeros((2, 2))])) == math.inf
-    assert metrics.path_condition(np.full((1, 2, 2), np.nan)) == math.inf
-
-
-@pytest.mark.parametrize("bad", [np.ones(3), np.ones((4, 2, 3)), np.ones((0, 2, 2)), "a"])
-def test_jacobians_that_are_none_are_refused(bad):
-    with pytest.raises(ValueError, match=r"^jacobians: expected"):
-        metrics.path_condition(bad)

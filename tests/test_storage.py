@@ -240,6 +240,10 @@ BAD = {
     "missing setting": (lambda p: written(p, settings={"dim": 2, "n_layers": 3}), "expected the settings .'beta', .*"),
     "unknown setting": (lambda p: written(p, settings=settings(callback="os.system")), "expected the settings"),
     "bad setting": (lambda p: written(p, settings=settings(beta=7)), "beta: expected a number in"),
+    "absurd dim beside a zero": (
+        lambda p: written(p, settings=settings(dim=10**12, n_layers=0)),
+        "expected sizes that .* stored numbers can fill",
+    ),
     "absurd dim": (
         lambda p: written(p, settings=settings(dim=10**12)),
         "expected sizes that .* stored numbers can fill",
@@ -277,7 +281,7 @@ BAD = {
     ),
     "half a report": (
         lambda p: written(p, report={"mse": 0.0}),
-        "report: expected the fields of FitReport, .*: .'history', .*'seconds'",
+        "report: expected the fields of FitReport, .*: .*'history', .*'seconds'",
     ),
     "mistyped report": (
         lambda p: written(p, report=asdict(FitReport(0.0, 1, "soon"))),

@@ -101,7 +101,7 @@ def test_trains_a_density(cache_size, draw):
         loss = -flow.log_prob(shown).mean()
         loss.backward()
         optimiser.step()
-        losses.append(float(loss))
+        losses.append(loss.item())
     best = -MultivariateNormal(torch.zeros(2, dtype=F64), shown.T.cov()).log_prob(shown).mean()
     assert losses[-1] < float(best) - 0.2  # than any Gaussian
     assert len(set(losses)) == len(losses)

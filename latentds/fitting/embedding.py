@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from ..arguments import whole_number
+from ..demonstration import jitter
 
 Array = NDArray[np.float64]
 
@@ -85,8 +86,7 @@ def arc_length_path(positions: Array, times: Array, n_points: int) -> tuple[Arra
         increasing from 0.
     """
     size = float(np.ptp(positions, axis=0).max())
-    jitter = np.median(np.linalg.norm(np.diff(positions, 2, axis=0), axis=1)) / math.sqrt(6)
-    apart = float(np.clip(4 * jitter, 5e-4 * size, 1e-2 * size))
+    apart = float(np.clip(4 * jitter(positions), 5e-4 * size, 1e-2 * size))
     away = np.linalg.norm(positions - positions[-1], axis=1) > apart
     last = min(int(np.flatnonzero(away)[-1]) + 1, len(positions) - 1) if away.any() else len(positions) - 1
     kept = [0]

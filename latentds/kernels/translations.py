@@ -8,6 +8,7 @@ rounded.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cache, partial
 from typing import Any
@@ -158,12 +159,12 @@ def pack(centers: Array, log_widths: Array, strengths: Array) -> Array:
         squared = 0.0
         for d in range(dim):
             squared += strengths[j, d] ** 2
-        scale = np.sqrt(np.e / 2 / (1 + squared)) / width
+        scale = np.sqrt(math.e / 2 / (1 + squared)) / width
         for d in range(dim):
             layers[j, d] = centers[j, d]
             layers[j, dim + d] = scale * strengths[j, d]
         layers[j, 2 * dim] = width * width
-        layers[j, 2 * dim + 1] = np.e / 2 * squared / (1 + squared)
+        layers[j, 2 * dim + 1] = math.e / 2 * squared / (1 + squared)
     return layers
 
 

@@ -27,6 +27,7 @@ def fitted():
     return small(seed=1, epochs=60).fit(wavy_motion(3))
 
 
+@pytest.mark.slow
 def test_rollout_is_the_integral_of_the_velocity(fitted):
     shown = wavy_motion(3)
     away = torch.tensor([[0.0], [0.2], [0.5]], dtype=torch.float64)
@@ -183,6 +184,7 @@ def test_a_closed_loop_is_refused():
         small(2).fit(Demonstration(loop, 0.1))
 
 
+@pytest.mark.slow
 def test_follows_a_winding_spiral():
     """Where velocities alone teach a shortcut; a fraction of the default's effort."""
     shown = datasets.unstable_spiral(3, 400)

@@ -40,6 +40,7 @@ def test_a_match_begins_with_every_shorter_one(method):
         assert error == pytest.approx(fitted.fit_report.mse, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_tuning_tries_the_whole_grid_once_and_is_kept(tmp_path, monkeypatch):
     shown = replace(datasets.unstable_spiral(1, 100), positions=3 * datasets.unstable_spiral(1, 100).positions)
     grid, more = tuning.Tuner(tmp_path / "optuna.sqlite", 1).greedy("FDM", shown, SMALL)

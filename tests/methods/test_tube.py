@@ -175,6 +175,7 @@ def test_position_at_time_t_is_the_demonstrations(clock):
     assert dtw(path, shown.positions) / len(shown) < 0.003 * shown.size
 
 
+@pytest.mark.slow
 def test_seven_joints():
     shown = wavy_motion(7, n_points=400)
     ds = fast(7, refined=True).fit(shown)

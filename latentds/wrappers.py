@@ -1,4 +1,7 @@
-"""A similarity transform and a change of pace: what moving, turning, scaling and slowing a motion comes down to."""
+"""What moving, turning, scaling and slowing a system comes down to: a similarity transform, and a change of pace.
+
+The system that wraps another, MovedDS, is in ``base``: every system makes one of itself.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from torch import Tensor, nn
 from .arguments import positive, real_array
 from .demonstration import Demonstration
 from .deploy.tables import FieldTables
+from .fidelity import Excerpt
 
 ORTHOGONAL = 1e-5
 """How far RᵀR of a rotation may be from the identity: as far as rounding to float32 leaves it, or typing it in."""
@@ -54,6 +58,14 @@ class Similarity(nn.Module):
         """The demonstration z(t) that becomes ``shown``."""
         own = [part.to(self.rotation) for part in (shown.positions, before, after)]
         return Demonstration(self.fetch(*own), shown.dt * float(self.speed), shown.name)
+
+    def carry_excerpt(self, shown: Excerpt, before: Tensor, after: Tensor) -> Excerpt:
+        """What becomes of an excerpt of a demonstration z(t)."""
+        own = [part.detach().double().cpu() for part in (self.rotation, before, after)]
+        scale, speed = float(self.scale), float(self.speed)
+        path = own[2] + scale * (torch.tensor(shown.path, dtype=torch.float64) - own[1]) @ own[0].mT
+        rows = tuple(map(tuple, path.tolist()))
+        return Excerpt(rows, shown.duration / speed, scale * speed * shown.fastest, scale * shown.ruler)
 
     def tables(self, tables: FieldTables, before: Tensor, after: Tensor) -> FieldTables:
         """Those of the field after, where ``tables`` are those of the field before; in latent space all moves alike."""

@@ -1,0 +1,244 @@
+"""How well a fitted system follows what it was shown, measured by its own motions and never assumed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .arguments import number_in, point_array, positive
+from .demonstration import Demonstration, jitter
+from .metrics import dtw, endpoint_error, path_length, path_length_ratio
+
+Array = NDArray[np.float64]
+
+MISS = 0.05
+"""Largest mean distance from the demonstration, in its sizes; good fits stay below half of it, even of 1 % noise."""
+END = 0.05
+"""Largest distance from the demonstrated end when the demonstration ends, in sizes of the motion."""
+SHORTEST, LONGEST = 0.8, 1.25
+"""Length of the motion over that of the demonstration: a shortcut is shorter, a detour longer."""
+NEAR, NEARBY_MISS = 0.01, 0.15
+"""A start so near the demonstrated one, in sizes, that nobody places it better, may miss by thrice ``MISS``: a tight
+spiral spreads good fits that far, a motion that jumps to another strand or to the goal misses by twice as much."""
+BESIDE, FASTEST = 0.1, 20.0
+"""Within so many sizes of the path no velocity exceeds the largest demonstrated one so many times. The pull of a tube
+that brings back what is so far off in a twentieth of the duration is a few times it; near a fold it is hundreds."""
+ROUNDING = 1e-3
+"""What rounding may do along a motion: let V rise by so much of itself, carry it so many sizes away when it is begun
+anew half-way, bring encode(decode(x)) so many latent lengths off x. Sound systems stay orders of magnitude below."""
+
+STARTS = 8
+"""Motions from nearby starts."""
+PLACES = 400
+"""Points beside the path at which velocities are looked at."""
+POINTS, MOST_POINTS, PER_SIZE = 200, 1000, 10
+"""Points of an excerpt: so many for each of its sizes that the path is long, within these bounds."""
+EXCERPTS = 8
+"""Most demonstrations of one fit that are looked at."""
+
+
+class FitWarning(UserWarning):
+    """A fit does not follow what it was shown; the text says in what, ``fit_report.fidelity`` has the figures."""
+
+
+@dataclass(frozen=True)
+class Excerpt:
+    """What a system keeps of a demonstration, so that it can be held against it later.
+
+    Attributes:
+        path: (T, n) positions, even in time from the start to the goal.
+        duration: seconds.
+        fastest: largest demonstrated speed, units per second.
+        ruler: length below which a step counts as noise, in the units of the positions.
+
+    Raises:
+        ValueError: naming the attribute, if one is none of this.
+    """
+
+    path: tuple[tuple[float, ...], ...]
+    duration: float
+    fastest: float
+    ruler: float
+
+    def __post_init__(self) -> None:
+        point_array(self.path, "path")
+        positive(self.duration, "duration")
+        positive(self.fastest, "fastest")
+        number_in(self.ruler, "ruler", 0, math.inf, ends="[)")
+
+    @classmethod
+    def of(cls, shown: Demonstration) -> Excerpt:
+        positions = shown.positions.numpy()
+        ruler = 4 * jitter(positions)
+        length = path_length(positions, ruler)
+        count = int(np.clip(PER_SIZE * length / shown.size, POINTS, MOST_POINTS))
+        path = shown.at(np.linspace(0, shown.duration, count))
+        fastest = float(torch.linalg.vector_norm(shown.velocities, dim=-1).max())
+        return cls(tuple(map(tuple, path.tolist())), shown.duration, fastest, ruler)
+
+    @classmethod
+    def of_each(cls, shown: Sequence[Demonstration]) -> tuple[Excerpt, ...]:
+        """Of each demonstration, or of ``EXCERPTS`` of them, evenly chosen."""
+        chosen = np.unique(np.linspace(0, len(shown) - 1, EXCERPTS).round().astype(int))
+        return tuple(cls.of(shown[i]) for i in chosen)
+
+
+class System(Protocol):
+    """What is measured: any :class:`~latentds.StableDS`."""
+
+    attractor: Tensor
+
+    def __call__(self, y: Tensor) -> Tensor: ...
+
+    def lyapunov(self, y: Tensor) -> Tensor: ...
+
+    def rollout(self, y0: Tensor, t: Tensor) -> Tensor: ...
+
+    def latent_error(self, y0: Tensor, t: Tensor) -> Tensor | None: ...
+
+
+@dataclass(frozen=True)
+class Fidelity:
+    """How a system follows what it was shown; of several demonstrations each figure is the worst.
+
+    Sizes are the largest extents of the demonstration along an axis; the motion lasts as long as it.
+
+    Attributes:
+        miss: distance of the motion from the demonstrated start and the demonstration: exact DTW over points, in sizes.
+        length_ratio: length of that motion over that of the demonstration.
+        end: distance of its end from the demonstrated one, in sizes.
+        nearby: as ``miss``, the worst of ``STARTS`` motions from ``NEAR`` sizes beside the demonstrated start, or from
+            a quarter of the way to where the demonstration comes back to it.
+        fastest: largest velocity on the demonstrated path and within ``BESIDE`` sizes of it, over the largest shown.
+        rise: largest rise of V along the motion, over V at its start.
+        halves: largest distance of the motion from the same one begun anew half-way, in sizes.
+        latent_error: see :meth:`~latentds.LatentDS.latent_error`; 0 for a system without latent space.
+        spread: of several demonstrations, how far they miss each other: as ``miss``, each and the next. Nobody can
+            follow all of them more closely, so it is added to what ``miss``, ``end`` and ``nearby`` may be.
+        shown: what it was held against.
+    """
+
+    miss: float
+    length_ratio: float
+    end: float
+    nearby: float
+    fastest: float
+    rise: float
+    halves: float
+    latent_error: float = 0.0
+    spread: float = 0.0
+    shown: tuple[Excerpt, ...] = field(default=(), repr=False)
+
+    @property
+    def follows(self) -> bool:
+        """Whether nothing is off."""
+        return not self.notes
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is off, in words, the worst first."""
+        return tuple(told for badness, told in sorted(self.findings, reverse=True) if not badness <= 1)
+
+    @property
+    def findings(self) -> tuple[tuple[float, str], ...]:
+        """Each figure over its limit, and in words."""
+        allowed = self.spread
+        folded = math.inf if not self.length_ratio > 0 else self.length_ratio
+        found = (
+            (self.miss / (MISS + allowed), f"misses its demonstration by {self.miss:.3g} of the size"),
+            (
+                max(folded / LONGEST, SHORTEST / folded),
+                f"moves {self.length_ratio:.3g} times as far as its demonstration",
+            ),
+            (self.end / (END + allowed), f"is {self.end:.3g} of the size from the end when the demonstration ends"),
+            (
+                self.nearby / (NEARBY_MISS + allowed),
+                f"misses by {self.nearby:.3g} of the size from a start {NEAR:.0%} beside the demonstrated one",
+            ),
+            (
+                self.fastest / FASTEST,
+                f"moves {self.fastest:.3g} times as fast as shown within {BESIDE:.0%} of the size from the path",
+            ),
+            (self.rise / ROUNDING, f"V rises by {self.rise:.3g} of itself along its motion"),
+            (self.halves / ROUNDING, f"its motion begun anew half-way is another one, {self.halves:.3g} sizes away"),
+            (
+                self.latent_error / ROUNDING,
+                f"rounding breaks its map, encode(decode(x)) is {self.latent_error:.3g} latent lengths from x",
+            ),
+        )
+        return tuple((math.inf if math.isnan(badness) else badness, told) for badness, told in found)
+
+
+@torch.no_grad()
+def measure(ds: System, shown: Sequence[Excerpt]) -> Fidelity:
+    """Hold a system against demonstrations of its dimension. Nothing is changed, and torch's generator not drawn from.
+
+    Args:
+        ds: the system as it is now, on any device.
+        shown: at least one.
+
+    Raises:
+        ValueError: if a motion of the system is not shaped as :meth:`~latentds.StableDS.rollout` promises.
+    """
+    draw = np.random.default_rng(0)
+    dim = len(shown[0].path[0])
+    around = draw.standard_normal((STARTS, dim))
+    around /= np.linalg.norm(around, axis=1, keepdims=True)
+    ball = draw.standard_normal((PLACES, dim + 2))  # the first n coordinates on the sphere of R^(n+2): even in a ball
+    ball = (ball / np.linalg.norm(ball, axis=1, keepdims=True))[:, :dim]
+    paths = [np.array(one.path) for one in shown]
+    every = [
+        _measure(ds, one, path, around[i :: len(shown)], ball[i :: len(shown)])
+        for i, (one, path) in enumerate(zip(shown, paths, strict=True))
+    ]
+    figures = {name: float(np.max([one[name] for one in every])) for name in every[0]}
+    ratios = [one["length_ratio"] for one in every]
+    figures["length_ratio"] = max(ratios, key=lambda ratio: abs(math.log(ratio)) if ratio > 0 else math.inf)
+    pairs = zip(paths, paths[1:] + paths[:1], strict=True) if len(paths) > 1 else ()
+    spread = [dtw(a, b) / max(len(a), len(b)) / _size(b) for a, b in pairs]
+    return Fidelity(**figures, spread=float(np.mean(spread)) if spread else 0.0, shown=tuple(shown))
+
+
+def _measure(ds: System, one: Excerpt, path: Array, around: Array, ball: Array) -> dict[str, float]:
+    size, count = _size(path), len(path)
+    distance = np.linalg.norm(path - path[0], axis=1)
+    away = np.argmax(distance > 2 * NEAR * size)
+    near = min(NEAR * size, float(distance[away:].min()) / 4)
+    starts = torch.from_numpy(np.concatenate([path[:1], path[0] + near * around])).to(ds.attractor)
+    times = torch.linspace(0, one.duration, count, dtype=torch.float64).to(ds.attractor.device)
+    moved = ds.rollout(starts, times)
+    if moved.shape != (len(starts), *path.shape):
+        raise ValueError(f"rollout: expected shape {(len(starts), *path.shape)}, got {tuple(moved.shape)}")
+    motions = moved.double().cpu().numpy()
+    energy, error = ds.lyapunov(moved[0]), ds.latent_error(starts[0], times)
+    missed = [dtw(motion, path) / count / size for motion in motions]
+    beside = path[np.arange(len(ball)) * count // len(ball)] + BESIDE * size * ball
+    velocity = ds(torch.from_numpy(np.concatenate([path, beside])).to(ds.attractor))
+    return {
+        "miss": missed[0],
+        "length_ratio": path_length_ratio(motions[0], path, one.ruler),
+        "end": endpoint_error(motions[0], path) / size,
+        "nearby": float(np.max(missed[1:], initial=0.0)),
+        "fastest": float(torch.linalg.vector_norm(velocity, dim=-1).max()) / one.fastest,
+        "rise": float(energy.diff().max() / energy[0]),
+        "halves": halves_apart(ds, moved[0], times) / size,
+        "latent_error": 0.0 if error is None else float(error.max()),
+    }
+
+
+def halves_apart(ds: System, motion: Tensor, times: Tensor) -> float:
+    """Largest distance of a motion (T, n) at ``times`` (T,) from the same one begun anew half-way: 0 for a flow."""
+    middle = len(times) // 2
+    anew = ds.rollout(motion[middle], times[middle:])
+    return float(torch.linalg.vector_norm(anew - motion[middle:], dim=-1).max())
+
+
+def _size(path: Array) -> float:
+    return float(np.ptp(path, axis=0).max())
