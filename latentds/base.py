@@ -19,7 +19,7 @@ from typing import Any, ClassVar, TypeVar
 import torch
 from torch import Tensor, nn
 
-from .arguments import check_points, positive, real_tensor, whole_number
+from .arguments import check_points, check_precision, positive, real_tensor, whole_number
 from .demonstration import Demonstration, demonstrations_of
 from .deploy.controller import Controller
 from .deploy.tables import FieldTables, field_tables
@@ -163,9 +163,10 @@ class StableDS(nn.Module, ABC):
             translation: t, (n,) finite; None is 0. A gradient of what the new system computes reaches it.
             scale: s > 0.
         """
-        turn = check_rotation(torch.eye(self.dim) if rotation is None else rotation, self.dim).to(self.attractor)
+        turn = torch.eye(self.dim) if rotation is None else check_rotation(rotation, self.dim)
+        turn = turn.to(self.attractor)
         factor = positive(scale, "scale")
-        goal = factor * turn @ self.attractor
+        goal = factor * (turn * self.attractor).sum(-1)
         if translation is not None:
             goal = goal + _vector(translation, self.attractor, "translation")
         return self._moved(goal, rotation=turn, scale=factor)
@@ -239,12 +240,7 @@ class StableDS(nn.Module, ABC):
             del self.__dict__["_assigning"]
 
     def _apply(self: Self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        dtype = fn(torch.zeros_like(self.attractor)).dtype
-        if dtype not in (torch.float32, torch.float64):
-            raise ValueError(
-                f"dtype: expected torch.float64 or torch.float32, got {dtype}, whose rounding, layer after layer, "
-                "makes another system; inputs of any real dtype are answered in it"
-            )
+        check_precision(fn(torch.zeros_like(self.attractor)).dtype)
         moved: Self = super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         return moved
 

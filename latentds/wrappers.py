@@ -44,15 +44,15 @@ class Similarity(nn.Module):
 
     def carry(self, z: Tensor, before: Tensor, after: Tensor) -> Tensor:
         """y of z, with the attractors z* = ``before`` and y* = ``after``: (..., n) -> (..., n)."""
-        return after + self.scale * (z - before) @ self.rotation.mT
+        return after + self.scale * _turned(z - before, self.rotation)
 
     def fetch(self, y: Tensor, before: Tensor, after: Tensor) -> Tensor:
         """z of y: (..., n) -> (..., n)."""
-        return before + (y - after) @ self.rotation / self.scale
+        return before + _turned(y - after, self.rotation.mT) / self.scale
 
     def velocity(self, v: Tensor) -> Tensor:
         """ẏ of ż: (..., n) -> (..., n)."""
-        return self.speed * self.scale * v @ self.rotation.mT
+        return self.speed * self.scale * _turned(v, self.rotation)
 
     def fetch_motion(self, shown: Demonstration, before: Tensor, after: Tensor) -> Demonstration:
         """The demonstration z(t) that becomes ``shown``."""
@@ -93,6 +93,11 @@ class Similarity(nn.Module):
             rest[-1].append(str(error))  # load_state_dict's list of what went wrong
             return
         super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+def _turned(v: Tensor, rotation: Tensor) -> Tensor:
+    """R v, not as a matrix product, which torch.autocast would take in half precision: (..., n) -> (..., n)."""
+    return (rotation * v.unsqueeze(-2)).sum(-1)
 
 
 def check_rotation(rotation: Any, dim: int) -> Tensor:
