@@ -85,7 +85,7 @@ def check_precision(dtype: torch.dtype) -> None:
 
 def refuse_tracing(what: str) -> None:
     """Refuse to be recorded by torch.jit.trace, which keeps the steps that one example took and says nothing."""
-    if torch.jit.is_tracing():  # type: ignore[no-untyped-call]
+    if torch._C._get_tracing_state() is not None:
         raise RuntimeError(f"{what} takes as many steps as its start needs and cannot be traced; trace the velocity")
 
 

@@ -302,7 +302,7 @@ def _bracketed_root(a: Tensor, b: Tensor, c: Tensor, max_steps: int = 64) -> Ten
 def _everywhere(done: Tensor) -> bool:
     """Whether a loop may end early; never under vmap or export, where no value can be read,
     nor while torch.jit.trace records how many steps one example took."""
-    if torch.compiler.is_compiling() or torch.jit.is_tracing():  # type: ignore[no-untyped-call]
+    if torch.compiler.is_compiling() or torch._C._get_tracing_state() is not None:
         return False
     try:
         return bool(done.all())
