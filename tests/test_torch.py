@@ -225,6 +225,7 @@ def test_workers_of_a_data_loader_compute_what_we_do(kind):
 
 RANK = """
 import sys, torch
+from torch.nn.parallel import DistributedDataParallel
 
 rank, store, learned = int(sys.argv[1]), sys.argv[2], sys.argv[3]
 torch.set_num_threads(1)
