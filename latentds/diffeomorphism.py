@@ -6,15 +6,17 @@ import copy
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from .arguments import check_points, whole_number
+from .arguments import check_points, check_precision, whole_number
 from .kernels import translations
+
+Self = TypeVar("Self", bound="Diffeomorphism")
 
 WIDTH_BOUND = math.sqrt(math.e / 2)
 """A layer x + exp(-ρ²‖x-c‖²) v is invertible while ρ‖v‖ < √(e/2) (Perrin and Schlehuber-Caissier 2016)."""
@@ -70,6 +72,11 @@ class Diffeomorphism(nn.Module, ABC):
     def inverse_box(self, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor] | None:
         """A box that holds ψ⁻¹ of all points of the box from ``low`` to ``high``, all (n,); None if none is known."""
         return None
+
+    def _apply(self: Self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        check_precision(fn(torch.zeros((), dtype=torch.float64)).dtype)
+        moved: Self = super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        return moved
 
     def layer_table(self) -> NDArray[np.float64] | None:
         """The map as the velocity kernel reads it, a row (c, v, ρ², ρ²‖v‖²) per layer (M, 2n+2); None if it cannot."""
@@ -293,8 +300,9 @@ def _bracketed_root(a: Tensor, b: Tensor, c: Tensor, max_steps: int = 64) -> Ten
 
 
 def _everywhere(done: Tensor) -> bool:
-    """Whether a loop may end early; never under vmap or export, where no value can be read."""
-    if torch.compiler.is_compiling():
+    """Whether a loop may end early; never under vmap or export, where no value can be read,
+    nor while torch.jit.trace records how many steps one example took."""
+    if torch.compiler.is_compiling() or torch._C._get_tracing_state() is not None:
         return False
     try:
         return bool(done.all())

@@ -32,6 +32,7 @@ class VelocityField(Protocol):
     """What is deployed: any :class:`~latentds.StableDS`."""
 
     dim: int
+    attractor: Tensor
 
     def tables(self) -> FieldTables | None: ...
 
