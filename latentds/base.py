@@ -21,7 +21,7 @@ from .arguments import check_points, real_tensor, whole_number
 from .demonstration import Demonstration, demonstrations_of
 from .deploy.controller import Controller
 from .deploy.tables import FieldTables, field_tables
-from .diffeomorphism import Diffeomorphism
+from .diffeomorphism import Diffeomorphism, eager_for_derivatives
 from .dynamics import LatentDynamics
 from .fidelity import Excerpt, Fidelity, FitWarning, measure
 from .files import write_tensors
@@ -289,6 +289,7 @@ class LatentDS(StableDS):
         # A subclass whose velocity is another one must say itself how to write it.
         return field_tables(self.diffeomorphism, self.dynamics) if type(self).forward is LatentDS.forward else None
 
+    @eager_for_derivatives
     def forward(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
         x, push = self.diffeomorphism.linearize(points)

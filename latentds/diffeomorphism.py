@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.autograd import forward_ad
 
 from .arguments import check_points, whole_number
 from .kernels import translations
+
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 WIDTH_BOUND = math.sqrt(math.e / 2)
 """A layer x + exp(-ρ²‖x-c‖²) v is invertible while ρ‖v‖ < √(e/2) (Perrin and Schlehuber-Caissier 2016)."""
@@ -99,6 +103,21 @@ class Layers(NamedTuple):
     """(m,) ρ > 0"""
 
 
+def eager_for_derivatives(method: Method) -> Method:
+    """Leave the graph of torch.compile for a call of which a derivative is asked: loops there have none, or wrong ones."""
+    eager = torch._disable_dynamo(method)
+
+    @functools.wraps(method)
+    def call(self: nn.Module, *tensors: Tensor) -> Any:
+        if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
+            asked = torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors, *self.parameters()))
+            if asked or torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
+                return eager(self, *tensors)  # under fullgraph=True freeze it, or call it within torch.no_grad()
+        return method(self, *tensors)
+
+    return cast(Method, call)
+
+
 class LocallyWeightedTranslations(Diffeomorphism):
     """ψ = ψ_M ∘ … ∘ ψ_1 with layers ψ_j(x) = x + exp(-ρ_j² ‖x - c_j‖²) v_j (paper, Sec. VI; Perrin 2016, eq. 5).
 
@@ -168,30 +187,34 @@ class LocallyWeightedTranslations(Diffeomorphism):
         self.log_widths.zero_()[:used] = widths.log().to(self.log_widths)
         self.log_widths[used:] = self.log_widths[:used].mean() if used else 0.0
 
+    @eager_for_derivatives
     def forward(self, x: Tensor) -> Tensor:
         check_points(self.dim, x, "x")
         if translations.can_use_kernel(self, x):
             return translations.forward(self, x)
         return self._through(_translate, x)[0]
 
+    @eager_for_derivatives
     def inverse(self, y: Tensor) -> Tensor:
         check_points(self.dim, y, "y")
         if translations.can_use_kernel(self, y):
             return translations.inverse(self, y)
-        return self._through(_return, y, reverse=True)[0]
+        return self._through(_untranslate, y, reverse=True)[0]
 
+    @eager_for_derivatives
     def linearize(self, y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         check_points(self.dim, y, "y")
         if translations.can_use_kernel(self, y):
             return translations.linearize(self, y)
         x = self.inverse(y)
+        return x, functools.partial(self._pushed, x)
 
-        def push(tangent: Tensor) -> Tensor:
-            points, tangents = torch.broadcast_tensors(x, tangent)
-            return self._through(_push, points, tangents.unsqueeze(-2))[1].squeeze(-2)
+    @eager_for_derivatives
+    def _pushed(self, x: Tensor, tangent: Tensor) -> Tensor:
+        points, tangents = torch.broadcast_tensors(x, tangent)  # type: ignore[no-untyped-call]
+        return self._through(_push, points, tangents.unsqueeze(-2))[1].squeeze(-2)
 
-        return x, push
-
+    @eager_for_derivatives
     def jacobian(self, x: Tensor) -> Tensor:
         check_points(self.dim, x, "x")
         if translations.can_use_kernel(self, x):
@@ -199,6 +222,7 @@ class LocallyWeightedTranslations(Diffeomorphism):
         columns = torch.eye(self.dim, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], self.dim, self.dim)
         return self._through(_push, x, columns)[1].mT
 
+    @eager_for_derivatives
     def log_abs_det_jacobian(self, x: Tensor) -> Tensor:
         check_points(self.dim, x, "x")
         return self._through(_swell, x, torch.zeros_like(x[..., 0]))[1]
@@ -240,11 +264,9 @@ class LocallyWeightedTranslations(Diffeomorphism):
         return self.centers, self.directions, torch.exp(2 * self.log_widths).unsqueeze(-1)
 
     def _through(self, step: Step, *state: Tensor, reverse: bool = False) -> tuple[Tensor, ...]:
-        """``state`` after a step for every layer, first to last or the other way round."""
-        if torch.compiler.is_exporting():
-            return _scanned(step, self._stacked(), state, reverse)
+        """``state`` after the step of every layer, first to last or the other way round."""
         if torch.compiler.is_compiling():
-            return _looped(step, self._stacked(), state, reverse)
+            return _loop_in_graph(step, self._stacked(), state, reverse)
         layers = self._layers()
         for layer in reversed(layers) if reverse else layers:
             state = step(*layer, *state)
@@ -252,14 +274,14 @@ class LocallyWeightedTranslations(Diffeomorphism):
 
 
 Step = Callable[..., tuple[Tensor, ...]]
-"""(c, v, ρ², *state) -> state, of one layer."""
+"""What one layer (c, v, ρ²) does to a state: (c, v, ρ², *state) -> state."""
 
 
 def _translate(c: Tensor, v: Tensor, q: Tensor, x: Tensor) -> tuple[Tensor]:
     return (x + torch.exp(-q * (x - c).square().sum(-1, keepdim=True)) * v,)
 
 
-def _return(c: Tensor, v: Tensor, q: Tensor, y: Tensor) -> tuple[Tensor]:
+def _untranslate(c: Tensor, v: Tensor, q: Tensor, y: Tensor) -> tuple[Tensor]:
     return (y - _root(y - c, v, q) * v,)
 
 
@@ -277,41 +299,49 @@ def _swell(c: Tensor, v: Tensor, q: Tensor, x: Tensor, log_volume: Tensor) -> tu
     return x + k * v, log_volume + torch.log1p((-2 * q * k * w * v).sum(-1))  # matrix determinant lemma
 
 
-def _scanned(step: Step, layers: tuple[Tensor, ...], state: tuple[Tensor, ...], reverse: bool) -> tuple[Tensor, ...]:
-    from torch._higher_order_ops import scan
+def _loop_in_graph(
+    step: Step, layers: tuple[Tensor, ...], state: tuple[Tensor, ...], reverse: bool
+) -> tuple[Tensor, ...]:
+    """The loop over the layers as one node of a graph, whose size so does not grow with their number.
 
-    def combine(state, layer):
-        new = step(*layer, *state)
-        return new, new[0].new_zeros(1)
+    torch.export records a ``scan``, which is differentiable; torch.compile a ``while_loop``, as its default compiler
+    takes a scan under ``fullgraph=True`` alone. On the CPU both compute in float64, as the kernels do.
+    """
+    from torch._higher_order_ops import scan, while_loop  # takes a second
 
-    return scan(combine, tuple(part.contiguous() for part in state), layers, reverse=reverse)[0]
+    def widened(tensor: Tensor) -> Tensor:
+        return (tensor.double() if tensor.is_cpu else tensor).contiguous()
 
+    layers, start = tuple(map(widened, layers)), tuple(map(widened, state))
+    if torch.compiler.is_exporting():
 
-def _looped(step: Step, layers: tuple[Tensor, ...], state: tuple[Tensor, ...], reverse: bool) -> tuple[Tensor, ...]:
-    from torch._higher_order_ops import while_loop
+        def one(state: tuple[Tensor, ...], layer: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], Tensor]:
+            return step(*layer, *state), layer[-1].clone()  # a scan must also hand out something
 
-    count = len(layers[0])
-    first, stride = (count - 1, -1) if reverse else (0, 1)
+        end, _ = scan(one, start, layers, reverse=reverse)
+    else:
+        count = len(layers[0])
+        first, stride = (count - 1, -1) if reverse else (0, 1)
 
-    def going(index, *state):
-        return ((index >= 0) & (index < count)).squeeze()
+        def unfinished(index: Tensor, *state: Tensor) -> Tensor:
+            return ((index >= 0) & (index < count)).squeeze()
 
-    def body(index, *state):
-        layer = (part.index_select(0, index).squeeze(0) for part in layers)
-        return index + stride, *step(*layer, *state)
+        def at(index: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+            layer = (part.index_select(0, index).squeeze(0) for part in layers)
+            return index + stride, *step(*layer, *state)
 
-    index = torch.full((1,), first, device=state[0].device)
-    return while_loop(going, body, (index, *(part.contiguous() for part in state)))[1:]
+        _, *end = while_loop(unfinished, at, (torch.full((1,), first, device=start[0].device), *start))
+    return tuple(new.to(old.dtype) for new, old in zip(end, state, strict=True))
 
 
 ROOT_STEPS = 8
+"""After which every root is found; see :func:`_solve`."""
 
 
 def _root(w: Tensor, v: Tensor, q: Tensor) -> Tensor:
     """The one s in [0, 1] with s = exp(-q ‖w - s v‖²), over (..., n) -> (..., 1); differentiable twice.
 
-    Newton's method alone fails on 3-4 % of hard layers; kept inside a shrinking bracket it never did. The root is
-    found without a graph; two free Newton steps from it then carry derivatives up to third order.
+    It is found without a graph; two free Newton steps from it then carry derivatives up to third order.
     """
     a = q * v.square().sum(-1, keepdim=True)
     b = q * (w * v).sum(-1, keepdim=True)
@@ -333,11 +363,13 @@ def _solve(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     In t = √(2a) (s - b/a) the equation has but two parameters, t + τ = κ exp(-t²/2), 0 <= κ < √e; a scan of them
     (``tests/test_diffeomorphism.py``) finds |s - k(s)| within 5 ε after these steps, at any distance from the bound.
     """
-    s = ((b - (a / 2).sqrt()) / a.clamp(min=torch.finfo(a.dtype).tiny)).clamp(0, 1)
+    tiny = torch.finfo(a.dtype).tiny
+    s = ((b - (a / 2).sqrt()) / a.clamp(min=tiny)).clamp(0, 1)
     for _ in range(ROOT_STEPS):
         g = b - a * s
         k = torch.exp((s * (g + b) - c).clamp(max=0))
-        gap, slope, bend = s - k, 1 - 2 * g * k, (2 * a - 4 * g * g) * k
-        spread = (4 * slope * slope - 6 * gap * bend).abs().sqrt()
-        s = (s - 3 * gap / (slope + spread).clamp(min=torch.finfo(a.dtype).tiny)).clamp(0, 1)
+        p = g * k
+        gap, slope = 3 * (s - k), 1 - 2 * p
+        spread = (slope * slope - gap * (a * k - 2 * g * p)).abs().sqrt()
+        s = (s - gap / (slope + 2 * spread).clamp(min=tiny)).clamp(0, 1)
     return torch.where(c > translations.BEYOND, 0.0, s)
