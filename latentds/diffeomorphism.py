@@ -358,18 +358,32 @@ def _root(w: Tensor, v: Tensor, q: Tensor) -> Tensor:
 def _solve(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     """The root s in [0, 1] of s = k(s) = exp(-(a s² - 2 b s + c)), for a < e/2 and b² <= a c.
 
-    Laguerre's method for cubics, started where k bends over and s - k(s) is flattest: near the invertibility bound
-    s - k(s) is close to a cubic with a threefold root there, at which other methods slow down. No branch, no bracket.
-    In t = √(2a) (s - b/a) the equation has but two parameters, t + τ = κ exp(-t²/2), 0 <= κ < √e; a scan of them
-    (``tests/test_diffeomorphism.py``) finds |s - k(s)| within 5 ε after these steps, at any distance from the bound.
+    Laguerre's method for cubics, from where k bends over and s - k(s) is flattest: near the invertibility bound it is
+    almost a cubic with a triple root there, which slows other methods down. In t = √(2a) (s - b/a) the equation has two
+    parameters, t + τ = κ exp(-t²/2) with 0 <= κ < √e, and a scan of them (tests/test_diffeomorphism.py) finds
+    |s - k(s)| within 5 rounding errors after eight steps, up to the bound itself; common layers need four.
     """
-    tiny = torch.finfo(a.dtype).tiny
+    tiny, eps = torch.finfo(a.dtype).tiny, torch.finfo(a.dtype).eps
     s = ((b - (a / 2).sqrt()) / a.clamp(min=tiny)).clamp(0, 1)
     for _ in range(ROOT_STEPS):
         g = b - a * s
         k = torch.exp((s * (g + b) - c).clamp(max=0))
+        gap = s - k
+        gap = torch.where(gap.abs() <= 2 * eps, 0.0, gap)  # where s - k is flat, rounding errors would carry s away
+        if _everywhere(gap == 0):
+            break
         p = g * k
-        gap, slope = 3 * (s - k), 1 - 2 * p
-        spread = (slope * slope - gap * (a * k - 2 * g * p)).abs().sqrt()
-        s = (s - gap / (slope + 2 * spread).clamp(min=tiny)).clamp(0, 1)
+        slope = 1 - 2 * p
+        spread = (slope * slope - 3 * gap * (a * k - 2 * g * p)).abs().sqrt()
+        s = (s - 3 * gap / (slope + 2 * spread).clamp(min=tiny)).clamp(0, 1)
     return torch.where(c > translations.BEYOND, 0.0, s)
+
+
+def _everywhere(done: Tensor) -> bool:
+    """Whether a loop may end early; never under vmap or export, where no value can be read."""
+    if torch.compiler.is_compiling():
+        return False
+    try:
+        return bool(done.all())
+    except RuntimeError:
+        return False
