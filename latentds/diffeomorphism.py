@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch._compile import _disable_dynamo
 from torch.autograd import forward_ad
 
 from .arguments import check_points, whole_number
@@ -104,8 +105,8 @@ class Layers(NamedTuple):
 
 
 def eager_for_derivatives(method: Method) -> Method:
-    """Leave the graph of torch.compile for a call of which a derivative is asked: loops there have none, or wrong ones."""
-    eager = torch._disable_dynamo(method)
+    """Leave the graph of torch.compile for calls whose derivative is asked: a loop there has none, or a wrong one."""
+    eager = _disable_dynamo(method)  # as torch.compiler.disable, without a second of imports
 
     @functools.wraps(method)
     def call(self: nn.Module, *tensors: Tensor) -> Any:
@@ -330,7 +331,8 @@ def _loop_in_graph(
             layer = (part.index_select(0, index).squeeze(0) for part in layers)
             return index + stride, *step(*layer, *state)
 
-        _, *end = while_loop(unfinished, at, (torch.full((1,), first, device=start[0].device), *start))
+        begin = torch.full((1,), first, device=start[0].device)
+        _, *end = while_loop(unfinished, at, (begin, *start))  # type: ignore[no-untyped-call]
     return tuple(new.to(old.dtype) for new, old in zip(end, state, strict=True))
 
 
