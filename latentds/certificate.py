@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -132,17 +132,15 @@ class _Search:
         radii = self.size * 10 ** (-3 * self._uniform(n_samples // 4, 1))
         near = self.goal.cpu() + radii * self._directions(n_samples // 4)
         points = torch.cat([inside.to(self.box), near.to(self.box).clamp(self.box[0], self.box[1])])
-        away = torch.linalg.vector_norm(points - self.goal, dim=-1) > 1e-4 * self.size
-        self.points = points[away]
+        at_goal = torch.linalg.vector_norm(points - self.goal, dim=-1) <= 1e-4 * self.size
+        self.points = points[~at_goal]
         with torch.no_grad():
             self.velocity = ds(self.points)
             speed = torch.linalg.vector_norm(self.velocity, dim=-1)
         finite = speed[torch.isfinite(speed)]
         self.speed = max(float(finite.median()) if len(finite) else 0.0, torch.finfo(self.goal.dtype).tiny)
-        kept = _kept(ds)
-        self.shown = tuple(one for one in kept if len(one.path[0]) == ds.dim)
-        self.strange = len(kept) - len(self.shown)
-        self.duration = self.shown[0].duration if self.shown else self.size / self.speed
+        self.shown = _shown(ds)
+        self.duration = self.shown[0].duration if self.shown else min(self.size / self.speed, 1e30)
         demonstrated = torch.tensor([one.path[0] for one in self.shown], dtype=torch.float64).reshape(-1, ds.dim)
         some = self.points[:: max(1, len(self.points) // 32)]
         self.starts = torch.cat([demonstrated.to(self.points), some])
@@ -155,10 +153,12 @@ class _Search:
         found += [self._attractor()]
         if found[0].verdict == "falsified":
             return found
+        with torch.no_grad():
+            self.paths = self.ds.rollout(self.starts, self.times)
         if isinstance(self.ds, LatentDS):
             found += self._maps(self.ds)
         found += [self._equilibria(), self._positive(), self._descent(), *self._motions(), self._convergence()]
-        return [*found, self._follows()] if self.shown or self.strange else found
+        return [*found, self._follows()] if self.shown else found
 
     def _finite(self) -> Line:
         broken = ~torch.isfinite(self.velocity).all(-1)
@@ -169,32 +169,29 @@ class _Search:
         return [] if told is None else [_settled(told.claim, told.n_checked, told.margin, told.detail, told.fold)]
 
     def _rate(self, ds: LatentDS) -> Line:
-        """Proven in a ball around x* that holds all of the region, or all samples if ψ tells no such ball.
+        """Proven in the ball around x* that holds all of the region, or all samples if ψ knows no such ball.
 
-        Where the numbers break what the proof rests on, samples must do.
+        Where the numbers break what the proof rests on, samples have to do, and the places that their motions pass.
         """
-        claim, goal = "latent motions approach the goal, -V̇/2V >= rate > 0", ds.dynamics.attractor
+        claim = "latent motions approach the goal, -V̇/2V >= rate > 0"
         with torch.no_grad():
-            x = torch.cat([ds.encode(self.points), ds.dynamics.flow(ds.encode(self.starts), self.times).flatten(0, 1)])
-            reach = torch.linalg.vector_norm(x - goal, dim=-1)
-            x = x[torch.isfinite(reach) & (reach > 0)]
+            frame, x = ds.frame(), ds.encode(self.points)
+            goal = frame.attractor
             box, where = ds.diffeomorphism.inverse_box(self.box[0], self.box[1]), "in the region"
             if box is None:
-                farthest, where = x - goal, "where samples lie"
+                farthest, where = (x - goal).nan_to_num(), "where samples lie"
             else:
                 farthest = torch.maximum((box[0] - goal).abs(), (box[1] - goal).abs()).unsqueeze(0)
             radius = float(torch.linalg.vector_norm(farthest, dim=-1).max())
-            bound = ds.dynamics.convergence_rate_bound(radius)
+            bound = ds.dynamics.convergence_rate_bound(radius, frame)
             if bound is not None and 0 < bound < math.inf:
                 return Line(claim, "proven", 1, bound, f"least rate {where}, per second:")
-            offset, points = x - goal, ds.decode(x)
-            rates = -(ds.dynamics(x, points) * offset).sum(-1) / offset.square().sum(-1)
-        rates = rates.nan_to_num(nan=-math.inf)
-        worst = int(rates.argmin())
-        holds = bool(rates[worst] > 0)
-        verdict: Verdict = "not falsified" if holds else "falsified"
-        place = None if holds else tuple(points[worst].tolist())
-        return Line(claim, verdict, len(rates), float(rates[worst]), "least rate of the samples, per second:", place)
+            x = torch.cat([x, ds.latent_motion(self.starts, self.times).flatten(0, 1)])
+            x = x[(x != goal).any(-1)]
+            y, offset = ds.decode(x), x - goal
+            rates = -(ds.dynamics(x, y, frame) * offset).sum(-1) / offset.square().sum(-1)
+        line = self._judge(claim, -rates, -torch.finfo(rates.dtype).tiny, "least rate of samples, per second:", y)
+        return replace(line, worst=-line.worst)
 
     def _attractor(self) -> Line:
         with torch.no_grad():
@@ -202,26 +199,25 @@ class _Search:
             later = self.ds.rollout(self.goal, torch.tensor([0.0, self.duration], dtype=torch.float64))
             errors = [speed, float((later[-1] - self.goal).abs().max()) / self.size]
             if isinstance(self.ds, LatentDS):
-                errors.append(float((self.ds.decode(self.ds.dynamics.attractor) - self.goal).abs().max()) / self.size)
+                errors.append(float((self.ds.decode(self.ds.frame().attractor) - self.goal).abs().max()) / self.size)
         worst = torch.tensor(errors).nan_to_num(nan=math.inf).amax().expand(1)
         return self._judge("the attractor rests", worst, self.tolerance, "relative error", self.goal.unsqueeze(0))
 
     def _maps(self, ds: LatentDS) -> list[Line]:
-        """ψ, its inverse and its Jacobian, at the samples and where their motions run."""
+        """ψ, its inverse and its Jacobian, at the samples and where motions run."""
+        passed = self.paths.flatten(0, 1)
+        points = torch.cat([self.points, passed])
         with torch.no_grad():
-            begun = ds.encode(self.starts)
-            x = ds.dynamics.flow(begun, self.times).flatten(0, 1)
-            y = ds.decode(x)
-            points = torch.cat([self.points, y])
-            there = torch.linalg.vector_norm(ds.decode(ds.encode(points)) - points, dim=-1) / self.size
-            # In the longest way to the goal: of a demonstration, if there is one.
-            way = torch.linalg.vector_norm(begun - ds.dynamics.attractor, dim=-1, keepdim=True)
+            x = ds.encode(points)
+            there = torch.linalg.vector_norm(ds.decode(x) - points, dim=-1) / self.size
+            # In units of the longest way to the goal: of a demonstration, if there is one.
+            way = torch.linalg.vector_norm(ds.encode(self.starts) - ds.frame().attractor, dim=-1, keepdim=True)
             back = ds.latent_error(self.starts, self.times) * way / way[: len(self.shown) or None].max()
         return [
             self._judge("decode inverts encode", there, self.tolerance, "relative error", points),
-            self._judge("encode inverts decode", back.flatten(), self.rounding, "error in latent lengths", y),
+            self._judge("encode inverts decode", back.flatten(), self.rounding, "error in latent lengths", passed),
             self._jacobian(ds),
-            self._conditioning(ds, torch.cat([ds.encode(self.points).detach(), x]), points),
+            self._conditioning(ds, x, points),
         ]
 
     def _jacobian(self, ds: LatentDS) -> Line:
@@ -294,13 +290,12 @@ class _Search:
     def _motions(self) -> list[Line]:
         """What holds of every flow: V falls along it, and half a motion and half a motion are the motion."""
         with torch.no_grad():
-            paths = self.ds.rollout(self.starts, self.times)
-            energy = self.ds.lyapunov(paths)
+            energy = self.ds.lyapunov(self.paths)
             rise = energy.diff(dim=-1) / energy[:, :1]
             middle = N_TIMES // 2
-            anew = self.ds.rollout(paths[:, middle], self.times[middle:])
-            apart = torch.linalg.vector_norm(anew - paths[:, middle:], dim=-1).amax(-1) / self.size
-        before = paths[:, :-1].flatten(0, 1)
+            anew = self.ds.rollout(self.paths[:, middle], self.times[middle:])
+            apart = torch.linalg.vector_norm(anew - self.paths[:, middle:], dim=-1).amax(-1) / self.size
+        before = self.paths[:, :-1].flatten(0, 1)
         return [
             self._judge("V falls along motions", rise.flatten(), self.tolerance, "largest rise over V(0)", before),
             self._judge("a motion is its two halves", apart, self.rounding, "largest distance", self.starts),
@@ -335,8 +330,8 @@ class _Search:
             velocity = self.ds(points)
         slope = (uphill * velocity).sum(-1)
         relative = torch.where(torch.isfinite(slope), slope / energy.detach(), math.inf)
-        lengths = (torch.linalg.vector_norm(vector, dim=-1, keepdim=True) for vector in (uphill, velocity))
-        return relative, (uphill / next(lengths) * (velocity / next(lengths))).sum(-1)
+        uphill, ahead = (v / torch.linalg.vector_norm(v, dim=-1, keepdim=True) for v in (uphill, velocity))
+        return relative, (uphill * ahead).sum(-1)
 
     def _convergence(self) -> Line:
         times = torch.tensor([0.0, HORIZON * self.duration], dtype=torch.float64).to(self.times.device)
@@ -347,13 +342,11 @@ class _Search:
 
     def _follows(self) -> Line:
         """Measured again, on the numbers as they are now, against what the report keeps of the demonstrations."""
-        claim, tries = "follows its demonstration", len(self.shown) + STARTS
-        if self.strange:
-            return Line(claim, "falsified", tries, self.strange, "demonstrations kept that have another dimension:")
         fidelity = measure(self.ds, self.shown)
         badness, told = max(fidelity.findings)
         verdict: Verdict = "not falsified" if fidelity.follows else "falsified"
-        return Line(claim, verdict, tries, badness, f"{told}; share of the limit")
+        tries = len(self.shown) + STARTS
+        return Line("follows its demonstration", verdict, tries, badness, f"{told}; share of the limit")
 
     def _judge(self, claim: str, badness: Tensor, limit: float, detail: str, points: Tensor) -> Line:
         """Falsified where ``badness`` (B,) is above ``limit``, or NaN, at one of the ``points`` (B, n)."""
@@ -380,11 +373,14 @@ def _settled(
     return Line(claim, "proven" if holds else "falsified", tries, worst, detail, counterexample)
 
 
-def _kept(ds: StableDS) -> tuple[Excerpt, ...]:
+def _shown(ds: StableDS) -> tuple[Excerpt, ...]:
     """What the report of its fit keeps of the demonstrations."""
     report = ds.fit_report
     fidelity = report.fidelity if isinstance(report, FitReport) else None
-    return () if fidelity is None else fidelity.shown
+    shown = () if fidelity is None else fidelity.shown
+    if any(len(one.path[0]) != ds.dim for one in shown):
+        raise ValueError(f"ds: expected a fit_report that keeps demonstrations of dimension {ds.dim}, got another")
+    return shown
 
 
 def _region(ds: StableDS, region: Any, generator: torch.Generator) -> Tensor:
@@ -393,16 +389,20 @@ def _region(ds: StableDS, region: Any, generator: torch.Generator) -> Tensor:
         if corners.shape != (2, ds.dim) or not np.isfinite(corners).all() or not (corners[0] < corners[1]).all():
             raise ValueError(f"region: expected (2, {ds.dim}) finite corners, low below high, got {corners.tolist()}")
         return torch.from_numpy(corners)
-    length = getattr(ds.dynamics, "length", None) if isinstance(ds, LatentDS) else None
-    if not isinstance(ds, LatentDS) or length is None:
+    if not isinstance(ds, LatentDS):
         raise ValueError(f"region: expected (2, {ds.dim}) corners, as {type(ds).__name__} implies none, got None")
     draws = torch.randn(256, ds.dim, generator=generator, dtype=torch.float64)
     directions = torch.nn.functional.normalize(draws, dim=-1)
     radii = torch.linspace(0.1, 1, 256, dtype=torch.float64).unsqueeze(-1)
     with torch.no_grad():
-        ball = ds.dynamics.attractor + length * (radii * directions).to(ds.attractor)
+        frame = ds.frame()
+        ball = frame.attractor + frame.length * (radii * directions).to(ds.attractor)
         points = torch.cat([ds.decode(ball), ds.attractor.unsqueeze(0)]).cpu().double()
     points = points[torch.isfinite(points).all(-1)]
+    if not bool((points != points[:1]).any()):
+        raise ValueError(
+            f"region: expected (2, {ds.dim}) corners, as a latent length of {float(frame.length)} implies none"
+        )
     low, high = points.amin(0), points.amax(0)
     margin = (0.25 * (high - low)).clamp(min=0.01 * float((high - low).max()))
     return torch.stack([low - margin, high + margin])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..diffeomorphism import Diffeomorphism
-from ..dynamics import LatentDynamics
+from ..dynamics import Frame, LatentDynamics
 
 Array = NDArray[np.float64]
 Self = TypeVar("Self", bound="VelocityField")
@@ -51,10 +51,10 @@ def tables_of(ds: VelocityField) -> FieldTables:
     """
     tables = ds.tables()
     if tables is None:
-        psi, dynamics = getattr(ds, "diffeomorphism", None), getattr(ds, "dynamics", None)
+        psi, dynamics, frame = (getattr(ds, name, None) for name in ("diffeomorphism", "dynamics", "frame"))
         if isinstance(psi, Diffeomorphism) and psi.layer_table() is None:
             missing = f"its diffeomorphism {type(psi).__name__} has no layer_table()"
-        elif isinstance(dynamics, LatentDynamics) and dynamics.tables() is None:
+        elif isinstance(dynamics, LatentDynamics) and frame is not None and dynamics.tables(frame()) is None:
             missing = f"its dynamics {type(dynamics).__name__}, or a time law of theirs, have no tables()"
         else:
             missing = "its velocity is its own, and its tables() do not say how to write it"
@@ -85,7 +85,7 @@ def pieces(law: Array) -> Array:
     return np.stack([starts, speeds, np.append(np.diff(speeds) / np.diff(starts), 0.0)])
 
 
-def field_tables(psi: Diffeomorphism, dynamics: LatentDynamics) -> FieldTables | None:
+def field_tables(psi: Diffeomorphism, dynamics: LatentDynamics, frame: Frame) -> FieldTables | None:
     """The field J_ψ(x) g(x), x = ψ⁻¹(y), as arrays; None where one of the two cannot be written so."""
-    layers, moves = psi.layer_table(), dynamics.tables()
+    layers, moves = psi.layer_table(), dynamics.tables(frame)
     return None if layers is None or moves is None else FieldTables(layers, *moves)

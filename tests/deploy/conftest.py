@@ -10,10 +10,10 @@ from latentds.dynamics import RayDynamics, TubeDynamics
 from latentds.time_law import ChebyshevLaw, PiecewiseLinearLaw
 
 DYNAMICS = {
-    "ray, eigenmap": lambda dim: RayDynamics(dim, ChebyshevLaw(2.0)),
-    "ray, uniform": lambda dim: RayDynamics(dim, PiecewiseLinearLaw.uniform(2.0)),
-    "tube, demonstrated": lambda dim: TubeDynamics(dim, demonstrated(), PiecewiseLinearLaw(torch.ones(1), torch.ones(1))),
-    "tube, eigenmap": lambda dim: TubeDynamics(dim, ChebyshevLaw(0.5), demonstrated()),
+    "ray, eigenmap": lambda: RayDynamics(ChebyshevLaw(2.0)),
+    "ray, uniform": lambda: RayDynamics(PiecewiseLinearLaw.uniform(2.0)),
+    "tube, demonstrated": lambda: TubeDynamics(demonstrated(), PiecewiseLinearLaw(torch.ones(1), torch.ones(1))),
+    "tube, eigenmap": lambda: TubeDynamics(ChebyshevLaw(0.5), demonstrated()),
 }
 
 
@@ -25,7 +25,7 @@ class Field(LatentDS):
     """Wide and strong layers, narrow and weak ones, and an attractor off the origin."""
 
     def __init__(self, dim, dynamics="tube, demonstrated", n_layers=30):
-        super().__init__(dim, LocallyWeightedTranslations(dim, n_layers), DYNAMICS[dynamics](dim))
+        super().__init__(dim, LocallyWeightedTranslations(dim, n_layers), DYNAMICS[dynamics]())
         draw = torch.Generator().manual_seed(dim)
         with torch.no_grad():
             psi = self.diffeomorphism
@@ -33,7 +33,7 @@ class Field(LatentDS):
             psi.log_widths.copy_(torch.linspace(-1, 3, n_layers))
             psi.strengths.normal_(0, 0.3, generator=draw)
             self.attractor.normal_(generator=draw)
-            self.dynamics.set_endpoints(self.encode(self.attractor + 1), self.encode(self.attractor))
+            self.start.copy_(self.attractor + 1)
 
     def fit(self, demonstration, *, progress=False):
         raise NotImplementedError

@@ -50,7 +50,7 @@ def run(tmp_path):
     def velocity(ds, points, in_place=False):
         c.write(ds, tmp_path / "field.h", name="field")
         library = ctypes.CDLL(str(build(tmp_path, LIBRARY, "-shared", "-fPIC")))
-        y = np.array(points)
+        y = np.asarray(points).copy()
         out = y if in_place else np.empty_like(y)
         pointers = (array.ctypes.data_as(ctypes.c_void_p) for array in (y, out))
         getattr(library, FUNCTIONS[y.dtype])(*pointers, ctypes.c_int(len(y)))

@@ -110,13 +110,13 @@ class Doubled(ChebyshevDS):
 
 
 class OwnRay(type(ChebyshevDS(1, n_layers=1).dynamics)):
-    def forward(self, x, y):
-        return 2 * super().forward(x, y)
+    def forward(self, x, y, frame):
+        return 2 * super().forward(x, y, frame)
 
 
 def own_dynamics():
     ds = ChebyshevDS(2, n_layers=2)
-    ds.dynamics = OwnRay(2, ds.dynamics.law)
+    ds.dynamics = OwnRay(ds.dynamics.law)
     return ds
 
 
