@@ -21,8 +21,8 @@ def write(ds: VelocityField, path: str | os.PathLike[str], *, name: str) -> None
     """Write the velocity of a system as it is now as a C header with two functions, for double and for float.
 
     ``NAME_velocity`` agrees with this package to rounding. ``NAME_velocityf`` computes in float alone, for processors
-    without double; it is off by some 1e-5 of the largest speed, by 1e-3 where cond(J_ψ) is 1e4. Both take at most
-    eight steps a layer, work on the stack, and keep nothing between calls, so that threads may share them. ``velocity``
+    without double; it is off by as much as the velocity changes when the position is rounded to float: 1e-7 to 1e-4 of
+    the largest speed as the field is steep, more where ψ nearly folds. Both take at most eight steps a layer, work on the stack, and keep nothing between calls, so that threads may share them. ``velocity``
     may be ``y`` itself. A position that is not finite has a velocity of NaN, except under ``-ffast-math``.
 
     Args:
