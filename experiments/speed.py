@@ -30,7 +30,7 @@ from scipy.integrate import solve_ivp
 from torch import Tensor, nn
 
 from baselines import SDSEF
-from experiments import figures, goals, loops, report
+from experiments import deployed, figures, goals, loops, report
 from experiments.goals import Goal
 from latentds import ChebyshevDS, datasets, kernels
 from latentds.fitting.matching import match
@@ -291,7 +291,7 @@ def exponents(curves: pd.DataFrame) -> pd.DataFrame:
 
 
 def main(
-    quick: Annotated[bool, typer.Option(help="Fewer rounds and no million points: under a minute.")] = False,
+    quick: Annotated[bool, typer.Option(help="Fewer rounds, no million points, one export: some two minutes.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for tables, curves and the picture.")] = Path("results/speed"),
 ) -> None:
     """Measure every public call against a torch loop and a measured floor, on one core."""
@@ -307,6 +307,7 @@ def main(
         *rollouts(ds, rounds),
         *fits(rounds),
         *sdsef_step(rounds),
+        *deployed.measure(quick),
     ]
     curves = growth(quick)
     summary = "\n\n".join(

@@ -224,6 +224,11 @@ class StableDS(nn.Module, ABC):
 
     def _times(self, t: Any) -> Tensor:
         """``t`` as seconds since its first entry, in the module's dtype."""
+        if torch.compiler.is_exporting():
+            raise ValueError(
+                "rollout: cannot be exported, as times must be seen to be checked; export the velocity, ds(y), and "
+                "integrate it, or decode and the flow of the dynamics"
+            )
         times = real_tensor(t, "t").to(self.attractor.device)
         if times.ndim != 1 or len(times) == 0:
             raise ValueError(f"t: expected shape (T,) with T >= 1, got {tuple(times.shape)}")

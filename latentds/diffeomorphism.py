@@ -382,8 +382,8 @@ def _solve(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 
 
 def _everywhere(done: Tensor) -> bool:
-    """Whether a loop may end early; never under vmap or export, where no value can be read."""
-    if torch.compiler.is_compiling():
+    """Whether a loop may end early; never under vmap, export or tracing, where no value can be read or is the last."""
+    if torch.compiler.is_compiling() or torch.jit.is_tracing():
         return False
     try:
         return bool(done.all())

@@ -22,8 +22,9 @@ def write(ds: VelocityField, path: str | os.PathLike[str], *, name: str) -> None
 
     ``NAME_velocity`` agrees with this package to rounding. ``NAME_velocityf`` computes in float alone, for processors
     without double; it is off by as much as the velocity changes when the position is rounded to float: 1e-7 to 1e-4 of
-    the largest speed as the field is steep, more where ψ nearly folds. Both take at most eight steps a layer, work on the stack, and keep nothing between calls, so that threads may share them. ``velocity``
-    may be ``y`` itself. A position that is not finite has a velocity of NaN, except under ``-ffast-math``.
+    the largest speed as the field is steep, more where ψ nearly folds. Both take at most eight steps a layer, work on
+    the stack, and keep nothing between calls, so that threads may share them. ``velocity`` may be ``y`` itself. A
+    position that is not finite has a velocity of NaN, except under ``-ffast-math``.
 
     Args:
         ds: a system of locally weighted translations with the dynamics of this package, fitted or not, in any dtype
