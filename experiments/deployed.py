@@ -1,9 +1,16 @@
-"""What becomes of a fitted system outside of eager torch: exported, compiled, as ONNX and as C; one core."""
+"""What becomes of a fitted system outside of eager torch: exported, compiled, as ONNX and as C, on one core.
+
+    python -m experiments.deployed
+
+A part of ``make speed`` that can be run alone, in minutes. Needs a C compiler and onnxruntime. Seconds are wall time and
+grow with what else runs.
+"""
 
 from __future__ import annotations
 
 import ctypes
 import io
+import os
 import re
 import subprocess
 import time
@@ -68,6 +75,12 @@ def timed(call: Callable[[], T], clock: Callable[[], float] = time.perf_counter)
     return call(), clock() - began
 
 
+def cpu_seconds() -> float:
+    """Of this process and of those that it waited for."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
 def within(what: str, found: Any, ds: LatentDS, y: Tensor, bound: float) -> Goal:
     """That velocities differ from eager torch by no more than ``bound``, in largest speeds."""
     expected = ds(y).double()
@@ -96,13 +109,14 @@ def in_torch(dim: int, dtype: torch.dtype) -> list[Goal]:
     torch.export.save(program, file)
     torch.compiler.reset()
     with torch._inductor.config.patch(force_disable_caches=True):
-        compiled = torch.compile(ds)
+        compiled, began = torch.compile(ds), cpu_seconds()
         found, first = timed(lambda: compiled(y))
+        busy = f"{cpu_seconds() - began:.0f} s of CPU time, the C++ compiler's included"
     note = f"{nodes} nodes, {size(small.graph_module)} at M = 2; a file of {file.getbuffer().nbytes / 1000:.0f} kB"
     return [
         seconds(f"torch.export, {label}", exported, 30, note),
         within(f"torch.export, {label}", program.module()(y), ds, y, LIMITS[dtype]),
-        seconds(f"torch.compile, {label}, first answer", first, 90),
+        seconds(f"torch.compile, {label}, first answer", first, 90, busy),
         within(f"torch.compile, {label}", found, ds, y, LIMITS[dtype]),
     ]
 
@@ -181,3 +195,10 @@ def measure(quick: bool) -> list[Goal]:
     """All of it; ``quick``: n = 3 and float64 alone in torch."""
     cases = [(3, torch.float64)] if quick else [(dim, dtype) for dim in SHOWN for dtype in LIMITS]
     return [*in_c(), *in_onnx(20), *(line for case in cases for line in in_torch(*case))]
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    torch.set_grad_enabled(False)
+    print(goals.table(measure(quick=False)))
+    print(f"\nLoad average at the end: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores.")

@@ -383,7 +383,7 @@ def _solve(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 
 def _everywhere(done: Tensor) -> bool:
     """Whether a loop may end early; never under vmap, export or tracing, where no value can be read or is the last."""
-    if torch.compiler.is_compiling() or torch.jit.is_tracing():
+    if torch.compiler.is_compiling() or torch._C._get_tracing_state() is not None:
         return False
     try:
         return bool(done.all())

@@ -18,7 +18,7 @@ from latentds.deploy import c
 from latentds.testing import wavy_motion
 
 COMPILER = shutil.which("gcc") or shutil.which("cc")
-STRICT = "-std=c99 -Wall -Wextra -Werror -pedantic -Wconversion -Wdouble-promotion -Wshadow -O1".split()
+STRICT = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-Wdouble-promotion", "-Wshadow"]
 LIBRARY = """
 #include "field.h"
 void in_double(const double *y, double *v, int n) {
@@ -37,7 +37,7 @@ def build(folder, source, *options):
     (folder / "source.c").write_text(source)
     built = folder / "built"
     done = subprocess.run(
-        [COMPILER, *STRICT, *options, "source.c", "-o", built, "-lm"], cwd=folder, capture_output=True, text=True
+        [COMPILER, *STRICT, "-O1", *options, "source.c", "-o", built, "-lm"], cwd=folder, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     return built
