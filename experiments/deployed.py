@@ -2,7 +2,7 @@
 
     python -m experiments.deployed
 
-A part of ``make speed`` that can be run alone, in minutes. Needs a C compiler and onnxruntime. Seconds are wall time and
+A part of ``make speed`` that runs alone, in minutes. Needs a C compiler and onnxruntime. Seconds are wall time and
 grow with what else runs.
 """
 
@@ -208,5 +208,5 @@ def measure(quick: bool) -> list[Goal]:
 if __name__ == "__main__":
     torch.set_num_threads(1)
     torch.set_grad_enabled(False)
-    print(goals.table(measure(quick=False)))
+    print(goals.table(measure(quick=False)), flush=True)
     print(f"\nLoad average at the end: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores.")
