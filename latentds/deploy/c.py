@@ -12,7 +12,8 @@ import torch
 
 from ..diffeomorphism import ROOT_STEPS
 from ..files import atomic_write
-from ..kernels.translations import BEYOND, NEGLIGIBLE
+from ..kernels.adjoint import NEGLIGIBLE
+from ..kernels.translations import BEYOND
 from ..time_law import TAIL
 from .tables import Array, FieldTables, VelocityField, describe, pieces, tables_of
 
