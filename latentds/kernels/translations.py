@@ -22,7 +22,7 @@ from torch import Tensor
 from . import dispatch
 from .adjoint import NEGLIGIBLE, forward_adjoint, inverse_adjoint
 from .compiling import OPTIONS, compiled
-from .dispatch import evaluate, is_plain, no_active_transforms, rows_of, run, tensor_of
+from .dispatch import BLOCK, evaluate, is_plain, no_active_transforms, rows_of, run, tensor_of
 from .lanes import WIDTH, anywhere, either, exp, load, store, where
 
 Array = NDArray[np.float64]
@@ -156,12 +156,15 @@ def _summed(kernel: Callable[..., None], layers: Array, points: Array, *by_row: 
     parts: list[tuple[int, Array]] = []
 
     def sweep(layers: Array, points: Array, *by_row: Array) -> None:
-        sums = np.zeros(shape)
-        kernel(layers, points, *by_row, sums.reshape(len(sums), -1))
-        parts.append((points.ctypes.data, sums.sum(-1)))
+        count = len(points)
+        for cut in range(0, count, BLOCK):
+            sums = np.zeros(shape)
+            rows = (a[cut : cut + BLOCK] if len(a) == count else a for a in (points, *by_row))
+            kernel(layers, *rows, sums.reshape(len(sums), -1))
+            parts.append((points[cut:].ctypes.data, sums.sum(-1)))
 
     run(lambda block: sweep, layers, points, *by_row)
-    # in the order of the points, not of the cores, so that the same sum is the same to the last bit
+    # block by block and in the order of the points: to the last bit the same on any number of cores
     total = np.zeros(shape[:2])
     for _, part in sorted(parts, key=lambda part: part[0]):
         total += part
