@@ -103,12 +103,13 @@ def restore_on_failure(ds: LatentDS, shown: Demonstration) -> Iterator[None]:
             off = float((ds.decode(ds.encode(points)) - points).abs().max()) / gap
             times = torch.linspace(0, shown.duration, POINTS, dtype=torch.float64)
             apart = halves_apart(ds, ds.rollout(points[0], times), times) / shown.size
-        if not off < torch.finfo(points.dtype).eps ** 0.4:
+        rounding = torch.finfo(points.dtype).eps ** 0.4
+        if not off < rounding:
             raise ValueError(
                 "demonstration: expected a motion whose map inverts in floats, got one that comes back off by "
                 f"{off:.1e} of the way from start to goal, which is {gap / shown.size:.1e} of its size"
             )
-        if not apart <= ROUNDING:
+        if not apart <= max(ROUNDING, rounding):
             raise ValueError(
                 "demonstration: expected a motion whose map inverts in floats, got one that rounding carries "
                 f"{apart:.1e} of its size away; try a smaller mu, fewer layers, or another method"
