@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from latentds.arguments import whole_number
 from latentds.base import FitReport, LatentDS
 from latentds.demonstration import Demonstration, demonstrations_of
-from latentds.dynamics import LatentDynamics, check_positive
+from latentds.dynamics import Frame, LatentDynamics
 
 from .couplings import AffineCouplings
 from .training import Plan, Training, descend
@@ -114,10 +114,9 @@ class SDSEF(LatentDS):
         psi.center.copy_(data.center)
         psi.scale.copy_(data.scale)
         self.attractor.copy_(torch.stack([d.goal for d in shown]).mean(0))
-        dynamics.attractor.copy_(psi.inverse(self.attractor))
+        starts = torch.stack([d.start for d in shown]).to(self.attractor)
+        self.start.copy_(starts[self.lyapunov(starts).argmax()])  # the farthest in latent space
         dynamics.duration.fill_(data.duration)
-        starts = psi.inverse(torch.stack([d.start for d in shown]).to(self.attractor))
-        dynamics.length.copy_((starts - dynamics.attractor).norm(dim=-1).max())
         log_speeds = dynamics.network(data.points.to(self.attractor))
         dynamics.log_speed_range.copy_(torch.stack([log_speeds.min() - 1, log_speeds.max() + 1]))
 
@@ -126,7 +125,7 @@ class NormalizedDescent(LatentDynamics):
     """ẋ = -exp(g(y)) z / max(‖z‖, ε), z = x - x*: straight to the goal, at a speed that is a function of y = ψ(x).
 
     g, a network of 2 x 100 leaky ReLUs over normalised y, is held within the range that it had along the
-    demonstration, widened by 1 each way, so that speeds far away stay bounded and above 0. ε is ``GUARD`` ``length``.
+    demonstration, widened by 1 each way, so that speeds far away stay bounded and above 0. ε is ``GUARD`` lengths.
 
     Args:
         diffeomorphism: ψ, for :meth:`flow` and for normalising; a reference, not a submodule.
@@ -134,28 +133,25 @@ class NormalizedDescent(LatentDynamics):
 
     Attributes:
         duration: () buffer, seconds in one unit of time of g.
-        length: () buffer, latent distance of the demonstrated start from x*.
         log_speed_range: (2,) buffer.
     """
 
     duration: Tensor
-    length: Tensor
     log_speed_range: Tensor
     psi: AffineCouplings
 
     def __init__(self, diffeomorphism: AffineCouplings, *, generator: torch.Generator | None = None) -> None:
-        super().__init__(diffeomorphism.dim)
+        super().__init__()
         object.__setattr__(self, "psi", diffeomorphism)
         sizes = [diffeomorphism.dim, 100, 100, 1]
         linear = [_linear(a, b, generator) for a, b in pairwise(sizes)]
         self.network = nn.Sequential(linear[0], nn.LeakyReLU(), linear[1], nn.LeakyReLU(), linear[2])
         self.register_buffer("duration", torch.ones((), dtype=torch.float64))
-        self.register_buffer("length", torch.ones((), dtype=torch.float64))
         self.register_buffer("log_speed_range", torch.tensor([-1.0, 1.0], dtype=torch.float64))
 
-    def forward(self, x: Tensor, y: Tensor) -> Tensor:
-        offset = x - self.attractor
-        distance = torch.linalg.vector_norm(offset, dim=-1).clamp(min=GUARD * self.length)
+    def forward(self, x: Tensor, y: Tensor, frame: Frame) -> Tensor:
+        offset = x - frame.attractor
+        distance = torch.linalg.vector_norm(offset, dim=-1).clamp(min=GUARD * frame.length)
         pull: Tensor = self.speed(y) / distance
         return -pull.unsqueeze(-1) * offset
 
@@ -164,27 +160,28 @@ class NormalizedDescent(LatentDynamics):
         log_speed: Tensor = self.network(self.psi.normalize(y)).squeeze(-1)
         return log_speed.clamp(*self.log_speed_range).exp() / self.duration
 
-    def flow(self, x: Tensor, t: Tensor) -> Tensor:
+    def flow(self, x: Tensor, t: Tensor, frame: Frame) -> Tensor:
         """Every motion runs on the ray from x to x*, so only its timing is integrated.
 
         The ray is sampled evenly in w, a C¹ function of the distance r that is linear along the demonstration,
         log r below the guard and logarithmic far outside. dt/dw is known at the nodes, the times there follow by a
         rule of fourth order, and w at the given times by cubic Hermite interpolation.
         """
-        offset = x - self.attractor
+        guard = GUARD * frame.length
+        offset = x - frame.attractor
         floor = torch.finfo(x.dtype).tiny ** 0.25
-        distance = (offset.square().sum(-1) + (floor * self.length) ** 2).sqrt()
-        begin = self._stretch(distance)
+        distance = (offset.square().sum(-1) + (floor * frame.length) ** 2).sqrt()
+        begin = _stretch(distance, guard)
         end = begin.detach().clamp(max=0.0) - TAIL
         spread = (begin.detach() - end).nan_to_num(0.0, 4096).flatten()
         # The demonstrated start spreads over a whole number of cells: rounding down or up there would make it jump.
         n_cells = 1 + int(torch.cat([spread, spread.new_tensor([8.0])]).amax().clamp(max=4096).round())
         step = (begin - end) / n_cells
         nodes = begin.unsqueeze(-1) - step.unsqueeze(-1) * torch.arange(n_cells + 1, dtype=x.dtype, device=x.device)
-        radii, growth = self._unstretch(nodes)
+        radii, growth = _unstretch(nodes, guard)
         direction = (offset / distance.unsqueeze(-1)).unsqueeze(-2)
-        path = self.psi(self.attractor + radii.unsqueeze(-1) * direction)
-        speed = self.speed(path) * (radii / (GUARD * self.length)).clamp(max=1.0)
+        path = self.psi(frame.attractor + radii.unsqueeze(-1) * direction)
+        speed = self.speed(path) * (radii / guard).clamp(max=1.0)
         slowness = growth / speed * step.unsqueeze(-1)
         stamps = _cumulative(slowness)
         times = t.expand(*stamps.shape[:-1], -1).clamp(max=stamps[..., -1:])
@@ -192,36 +189,26 @@ class NormalizedDescent(LatentDynamics):
         here, there = stamps.gather(-1, cell), stamps.gather(-1, cell + 1)
         first, last = slowness.gather(-1, cell), slowness.gather(-1, cell + 1)
         along = cell + _hermite((times - here) / (there - here), (there - here) / first, (there - here) / last)
-        later, _ = self._unstretch(begin.unsqueeze(-1) - step.unsqueeze(-1) * along)
-        states: Tensor = self.attractor + later.unsqueeze(-1) * direction
+        later, _ = _unstretch(begin.unsqueeze(-1) - step.unsqueeze(-1) * along, guard)
+        states: Tensor = frame.attractor + later.unsqueeze(-1) * direction
         return states
 
-    def convergence_rate_bound(self, radius: float) -> float:
+    def convergence_rate_bound(self, radius: float, frame: Frame) -> float:
         finite = all(bool(torch.isfinite(part).all()) for part in self.state_dict().values())
-        if not (finite and self.duration > 0 and self.length > 0):
+        if not (finite and self.duration > 0 and frame.length > 0):
             return -math.inf
         slowest = float(torch.exp(self.log_speed_range.min()) / self.duration)
-        return slowest / max(radius, GUARD * float(self.length))
+        return slowest / max(radius, GUARD * float(frame.length))
 
-    def check_buffers(self, buffers: Mapping[str, Tensor]) -> None:
-        check_positive(buffers, "length", "duration")
-        if (ends := buffers.get("log_speed_range")) is not None and not bool((ends.diff() >= 0).all()):
-            raise ValueError(f"log_speed_range: expected its lower end first, got {ends.tolist()}")
-
-    def _stretch(self, r: Tensor) -> Tensor:
-        """w(r): log(r/ε) below the guard ε, r/ε - 1 up to FAR lengths, then 100 asinh of a hundredth of the rest."""
-        unit = r / (GUARD * self.length)
-        edge = FAR / GUARD
-        beyond = torch.asinh((unit - edge).clamp(min=0) / 100) * 100
-        return torch.log(unit.clamp(max=1.0)) + unit.clamp(1.0, edge) - 1 + beyond
-
-    def _unstretch(self, w: Tensor) -> tuple[Tensor, Tensor]:
-        """r(w) and dr/dw."""
-        edge = FAR / GUARD - 1
-        tail = torch.exp(w.clamp(max=0.0))
-        beyond = (w - edge).clamp(min=0) / 100
-        scale = GUARD * self.length
-        return scale * (tail + w.clamp(0.0, edge) + 100 * torch.sinh(beyond)), scale * tail * torch.cosh(beyond)
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        """Refuse numbers that no such dynamics can have: those of a file, say."""
+        duration, ends = (state_dict.get(prefix + name) for name in ("duration", "log_speed_range"))
+        if duration is not None and not bool((duration > 0).all()):
+            rest[-1].append(f"duration: expected a number > 0, got {duration.tolist()}")
+        elif ends is not None and not bool((ends.diff() >= 0).all()):
+            rest[-1].append(f"log_speed_range: expected its lower end first, got {ends.tolist()}")
+        else:
+            super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
 class _Normalized(NamedTuple):
@@ -373,6 +360,22 @@ def _unit(z: Tensor) -> Tensor:
 def _linearize(learner: SDSEF) -> Callable[[Tensor], tuple[Tensor, Callable[[Tensor], Tensor]]]:
     psi = learner.diffeomorphism
     return psi.compiled_linearize() if learner.attractor.device.type == "cpu" else psi.linearize
+
+
+def _stretch(r: Tensor, guard: Tensor) -> Tensor:
+    """w(r): log(r/ε) below the guard ε, r/ε - 1 up to FAR lengths, then 100 asinh of a hundredth of the rest."""
+    unit = r / guard
+    edge = FAR / GUARD
+    beyond = torch.asinh((unit - edge).clamp(min=0) / 100) * 100
+    return torch.log(unit.clamp(max=1.0)) + unit.clamp(1.0, edge) - 1 + beyond
+
+
+def _unstretch(w: Tensor, guard: Tensor) -> tuple[Tensor, Tensor]:
+    """r(w) and dr/dw."""
+    edge = FAR / GUARD - 1
+    tail = torch.exp(w.clamp(max=0.0))
+    beyond = (w - edge).clamp(min=0) / 100
+    return guard * (tail + w.clamp(0.0, edge) + 100 * torch.sinh(beyond)), guard * tail * torch.cosh(beyond)
 
 
 def _cumulative(f: Tensor) -> Tensor:

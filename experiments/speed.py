@@ -141,12 +141,16 @@ def against_floor(ds: ChebyshevDS, rounds: int) -> list[Goal]:
 
 def against_loop(ds: ChebyshevDS, rounds: int) -> list[Goal]:
     layers, many = loops.layers_of(ds), ds.decode(latent_points(ds, 1000))
+
+    def latent_velocity(x: Tensor) -> Tensor:
+        return ds.dynamics(x, x, ds.frame())
+
     found = []
     for label, points, least in (
         ("velocity of 1000 points", many, 80),
         ("velocity of one point, ds(y)", SHOWN.positions[400], 100),
     ):
-        fast, slow = partial(ds, points), partial(loops.velocity, layers, points, lambda x: ds.dynamics(x, x))
+        fast, slow = partial(ds, points), partial(loops.velocity, layers, points, latent_velocity)
         torch.testing.assert_close(fast(), slow(), rtol=1e-8, atol=1e-8)
         found.append(race(f"{label}, torch loop", least, slow, fast, rounds))
     return found

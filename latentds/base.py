@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import hashlib
 import inspect
 import json
 import math
@@ -22,10 +24,12 @@ from .demonstration import Demonstration, demonstrations_of
 from .deploy.controller import Controller
 from .deploy.tables import FieldTables, field_tables
 from .diffeomorphism import Diffeomorphism
-from .dynamics import LatentDynamics
+from .dynamics import Frame, LatentDynamics
 from .fidelity import Excerpt, Fidelity, FitWarning, measure
 from .files import write_tensors
 from .integrate import integrate
+from .kernels.dispatch import no_active_transforms
+from .memory import Memo, tensors_of
 
 FORMAT = 2
 """Of the files of systems; raised when they change so that another latentds would misread them."""
@@ -47,6 +51,7 @@ class FitReport:
             follow the demonstration).
         learned_from: name and SHA-256 of each demonstration.
         fidelity: how the fitted system follows what it was shown, measured after every fit, whatever the method.
+        state: SHA-256 of the system's state after the fit, to the precision of float32; filled in by the system.
     """
 
     mse: float
@@ -56,6 +61,7 @@ class FitReport:
     notes: tuple[str, ...] = ()
     learned_from: tuple[tuple[str, str], ...] = ()
     fidelity: Fidelity | None = None
+    state: str = ""
 
 
 class StableDS(nn.Module, ABC):
@@ -68,17 +74,21 @@ class StableDS(nn.Module, ABC):
     against the demonstration (:mod:`latentds.fidelity`). The figures are in ``fit_report.fidelity``; what is off is in
     ``fit_report.notes`` and in a :class:`~latentds.FitWarning`.
 
-    Everything is computed in the module's dtype (float64 unless moved with ``.to``) and returned in the dtype of
-    the input. Arrays are accepted where tensors are.
+    Everything is computed in the module's dtype (float64 unless moved with ``.to``; float32 is the narrowest) and
+    returned in the dtype of the input. Arrays are accepted where tensors are.
 
     Args:
         dim: n >= 1.
+
+    Attributes:
+        attractor: y*, (n,), where all motions end. What a method's ``fit`` writes into the buffer, the motion follows;
+            it is not to be replaced.
     """
 
     report_type: ClassVar[type[FitReport]] = FitReport
     """The class of ``fit_report``; a method that tells more than every method does names its own."""
     attractor: Tensor
-    fit_report: FitReport | None
+    _fit_report: FitReport | None
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -91,6 +101,22 @@ class StableDS(nn.Module, ABC):
         fit = inspect.getattr_static(cls, "fit")
         if inspect.isfunction(fit) and not getattr(fit, "__isabstractmethod__", False) and not hasattr(fit, "measured"):
             cls.fit = _measured(fit)  # type: ignore[method-assign]
+
+    @property
+    def fit_report(self) -> FitReport | None:
+        """What the last fit reached; None before one. A ``fit`` sets it last, once the parameters are found."""
+        return self._fit_report
+
+    @fit_report.setter
+    def fit_report(self, report: FitReport | None) -> None:
+        if report is not None and not report.state:
+            report = replace(report, state=self._fingerprint())
+        self._fit_report = report
+
+    @property
+    def fit_report_is_current(self) -> bool:
+        """Whether ``fit_report`` tells of this system as it is: fitted, and neither trained nor edited since."""
+        return self.fit_report is not None and self.fit_report.state == self._fingerprint()
 
     @abstractmethod
     def fit(self: Self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> Self:
@@ -158,6 +184,35 @@ class StableDS(nn.Module, ABC):
         except TypeError as error:
             raise ValueError(f"ds: expected a fit_report of numbers, strings and tuples, got {error}") from None
         write_tensors(path, self.state_dict(), about)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        held = self.__dict__.get("_buffers", {}).get("attractor")
+        if name == "attractor" and held is not None and value is not held and not self.__dict__.get("_assigning"):
+            raise AttributeError("attractor: cannot be replaced; ds.with_goal(goal) is this motion to another goal")
+        super().__setattr__(name, value)
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        self.__dict__["_assigning"] = True  # load_state_dict(…, assign=True) replaces the attractor with all the rest
+        try:
+            super()._load_from_state_dict(*args, **kwargs)
+        finally:
+            del self.__dict__["_assigning"]
+
+    def _apply(self: Self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        dtype = fn(torch.zeros_like(self.attractor)).dtype
+        if dtype not in (torch.float32, torch.float64):
+            raise ValueError(
+                f"dtype: expected torch.float64 or torch.float32, got {dtype}, whose rounding, layer after layer, "
+                "makes another system; inputs of any real dtype are answered in it"
+            )
+        moved: Self = super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
+        return moved
+
+    def _fingerprint(self) -> str:
+        digest = hashlib.sha256()
+        for name, value in self.state_dict().items():
+            digest.update(name.encode() + value.detach().to("cpu", torch.float32).numpy().tobytes())
+        return digest.hexdigest()
 
     def _points(self, y: Any, name: str = "y") -> tuple[Tensor, torch.dtype]:
         """``y`` in the module's dtype, and the dtype in which the caller wants the answer."""
@@ -237,16 +292,60 @@ class LatentDS(StableDS):
 
     f(y) = J_ψ(x) g(x) with x = ψ⁻¹(y) (paper, eq. 4), V(y) = ‖x - x*‖². Methods subclass it and implement ``fit``.
 
+    What was shown is kept in demonstration space; its latent image, :meth:`frame`, follows from it. So the attractor
+    stays where it is however ψ is trained, and where it is moved in place, motions end there.
+
     Args:
         dim: n >= 1.
         diffeomorphism: ψ; the identity until fitted.
         dynamics: g, with its flow.
+
+    Attributes:
+        start: (n,) buffer, where the demonstrated motion begins; the first unit vector until fitted.
     """
+
+    start: Tensor
+    _memo: Memo[Frame]
 
     def __init__(self, dim: int, diffeomorphism: Diffeomorphism, dynamics: LatentDynamics) -> None:
         super().__init__(dim)
+        self.register_buffer("start", torch.eye(1, self.dim, dtype=torch.float64)[0])
         self.diffeomorphism = diffeomorphism
         self.dynamics = dynamics
+        self._memo = Memo[Frame]()
+
+    def frame(self) -> Frame:
+        """The latent attractor, axis and length, as ψ, ``attractor`` and ``start`` make them now."""
+        return self._kept_frame() or self._new_frame()
+
+    def _kept_frame(self) -> Frame | None:
+        """The frame, made anew when something changed; None where a derivative or a transform must see it made."""
+        psi, attractor = self.diffeomorphism, self.attractor
+        sources = [attractor, self.start, *tensors_of(psi)]
+        differentiated = torch.is_grad_enabled() and any(source.requires_grad for source in sources)
+        if differentiated or attractor.is_meta or not no_active_transforms():
+            return None
+        return self._memo.of((psi, attractor.dtype), sources, self._new_frame)
+
+    def _new_frame(self) -> Frame:
+        return Frame.between(*self.diffeomorphism.inverse(self._ends()).unbind())
+
+    def _ends(self) -> Tensor:
+        return torch.stack([self.start, self.attractor])
+
+    def _linearize(self, y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor], Frame]:
+        """x = ψ⁻¹(y), the map of tangents by J_ψ(x), and the frame; in one sweep, if the frame is to be made."""
+        frame = self._kept_frame()
+        if frame is not None:
+            return *self.diffeomorphism.linearize(y), frame
+        ends = self._ends()
+        rows, push_rows = self.diffeomorphism.linearize(torch.cat([y.reshape(-1, self.dim), ends]))
+
+        def push(tangent: Tensor) -> Tensor:
+            tangents = torch.cat([tangent.reshape(-1, self.dim), torch.zeros_like(ends)])
+            return push_rows(tangents)[:-2].reshape(tangent.shape)
+
+        return rows[:-2].reshape(y.shape), push, Frame.between(rows[-2], rows[-1])
 
     def encode(self, y: Tensor) -> Tensor:
         """ψ⁻¹: demonstration -> latent, (..., n) -> (..., n)."""
@@ -271,6 +370,10 @@ class LatentDS(StableDS):
         safe = torch.where(finite[..., None, None], jacobians, torch.eye(self.dim).to(jacobians))
         return torch.where(finite, torch.linalg.cond(safe), math.inf)
 
+    def latent_motion(self, y0: Tensor, t: Tensor) -> Tensor:
+        """Where ψ⁻¹ of the motion from ``y0`` is at times ``t``: (..., n), (T,) seconds -> (..., T, n)."""
+        return self.dynamics.flow(self.encode(y0), self._times(t), self.frame())
+
     def latent_error(self, y0: Tensor, t: Tensor) -> Tensor:
         """How far encode(decode(x)) comes back from x along the latent motion from ``y0``, in the length of its way.
 
@@ -279,27 +382,29 @@ class LatentDS(StableDS):
         Returns:
             (..., n), (T,) seconds -> (..., T).
         """
-        begun = self.encode(y0)
-        x = self.dynamics.flow(begun, self._times(t))
-        way = torch.linalg.vector_norm(begun - self.dynamics.attractor, dim=-1, keepdim=True)
+        x, frame = self.latent_motion(y0, t), self.frame()
+        way = torch.linalg.vector_norm(x[..., 0, :] - frame.attractor, dim=-1, keepdim=True)
         error: Tensor = torch.linalg.vector_norm(self.encode(self.decode(x)) - x, dim=-1) / way
         return error
 
     def tables(self) -> FieldTables | None:
-        # A subclass whose velocity is another one must say itself how to write it.
-        return field_tables(self.diffeomorphism, self.dynamics) if type(self).forward is LatentDS.forward else None
+        if type(self).forward is not LatentDS.forward:
+            return None  # a subclass whose velocity is another one must say itself how to write it
+        exact = copy.deepcopy(self).to("cpu", torch.float64)
+        return field_tables(exact.diffeomorphism, exact.dynamics, exact.frame())
 
     def forward(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
-        x, push = self.diffeomorphism.linearize(points)
-        return push(self.dynamics(x, points)).to(wanted)
+        x, push, frame = self._linearize(points)
+        return push(self.dynamics(x, points, frame)).to(wanted)
 
     def lyapunov(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
-        return self.dynamics.lyapunov(self.diffeomorphism.inverse(points)).to(wanted)
+        x, _, frame = self._linearize(points)
+        return self.dynamics.lyapunov(x, frame).to(wanted)
 
     def rollout(self, y0: Tensor, t: Tensor) -> Tensor:
         points, wanted = self._points(y0, "y0")
         times = self._times(t)
-        latent = self.dynamics.flow(self.diffeomorphism.inverse(points), times)
-        return self._begun_at(y0, self.diffeomorphism(latent).to(wanted))
+        x, _, frame = self._linearize(points)
+        return self._begun_at(y0, self.diffeomorphism(self.dynamics.flow(x, times, frame)).to(wanted))

@@ -173,22 +173,23 @@ class _Search:
 
         Where the numbers break what the proof rests on, samples have to do, and the places that their motions pass.
         """
-        claim, goal = "latent motions approach the goal, -V̇/2V >= rate > 0", ds.dynamics.attractor
+        claim = "latent motions approach the goal, -V̇/2V >= rate > 0"
         with torch.no_grad():
-            x = ds.encode(self.points)
+            frame, x = ds.frame(), ds.encode(self.points)
+            goal = frame.attractor
             box, where = ds.diffeomorphism.inverse_box(self.box[0], self.box[1]), "in the region"
             if box is None:
                 farthest, where = (x - goal).nan_to_num(), "where samples lie"
             else:
                 farthest = torch.maximum((box[0] - goal).abs(), (box[1] - goal).abs()).unsqueeze(0)
             radius = float(torch.linalg.vector_norm(farthest, dim=-1).max())
-            bound = ds.dynamics.convergence_rate_bound(radius)
+            bound = ds.dynamics.convergence_rate_bound(radius, frame)
             if bound is not None and 0 < bound < math.inf:
                 return Line(claim, "proven", 1, bound, f"least rate {where}, per second:")
-            x = torch.cat([x, ds.dynamics.flow(ds.encode(self.starts), self.times).flatten(0, 1)])
+            x = torch.cat([x, ds.latent_motion(self.starts, self.times).flatten(0, 1)])
             x = x[(x != goal).any(-1)]
             y, offset = ds.decode(x), x - goal
-            rates = -(ds.dynamics(x, y) * offset).sum(-1) / offset.square().sum(-1)
+            rates = -(ds.dynamics(x, y, frame) * offset).sum(-1) / offset.square().sum(-1)
         line = self._judge(claim, -rates, -torch.finfo(rates.dtype).tiny, "least rate of samples, per second:", y)
         return replace(line, worst=-line.worst)
 
@@ -198,7 +199,7 @@ class _Search:
             later = self.ds.rollout(self.goal, torch.tensor([0.0, self.duration], dtype=torch.float64))
             errors = [speed, float((later[-1] - self.goal).abs().max()) / self.size]
             if isinstance(self.ds, LatentDS):
-                errors.append(float((self.ds.decode(self.ds.dynamics.attractor) - self.goal).abs().max()) / self.size)
+                errors.append(float((self.ds.decode(self.ds.frame().attractor) - self.goal).abs().max()) / self.size)
         worst = torch.tensor(errors).nan_to_num(nan=math.inf).amax().expand(1)
         return self._judge("the attractor rests", worst, self.tolerance, "relative error", self.goal.unsqueeze(0))
 
@@ -210,7 +211,7 @@ class _Search:
             x = ds.encode(points)
             there = torch.linalg.vector_norm(ds.decode(x) - points, dim=-1) / self.size
             # In units of the longest way to the goal: of a demonstration, if there is one.
-            way = torch.linalg.vector_norm(ds.encode(self.starts) - ds.dynamics.attractor, dim=-1, keepdim=True)
+            way = torch.linalg.vector_norm(ds.encode(self.starts) - ds.frame().attractor, dim=-1, keepdim=True)
             back = ds.latent_error(self.starts, self.times) * way / way[: len(self.shown) or None].max()
         return [
             self._judge("decode inverts encode", there, self.tolerance, "relative error", points),
@@ -388,18 +389,20 @@ def _region(ds: StableDS, region: Any, generator: torch.Generator) -> Tensor:
         if corners.shape != (2, ds.dim) or not np.isfinite(corners).all() or not (corners[0] < corners[1]).all():
             raise ValueError(f"region: expected (2, {ds.dim}) finite corners, low below high, got {corners.tolist()}")
         return torch.from_numpy(corners)
-    length = getattr(ds.dynamics, "length", None) if isinstance(ds, LatentDS) else None
-    if not isinstance(ds, LatentDS) or length is None:
+    if not isinstance(ds, LatentDS):
         raise ValueError(f"region: expected (2, {ds.dim}) corners, as {type(ds).__name__} implies none, got None")
     draws = torch.randn(256, ds.dim, generator=generator, dtype=torch.float64)
     directions = torch.nn.functional.normalize(draws, dim=-1)
     radii = torch.linspace(0.1, 1, 256, dtype=torch.float64).unsqueeze(-1)
     with torch.no_grad():
-        ball = ds.dynamics.attractor + length * (radii * directions).to(ds.attractor)
+        frame = ds.frame()
+        ball = frame.attractor + frame.length * (radii * directions).to(ds.attractor)
         points = torch.cat([ds.decode(ball), ds.attractor.unsqueeze(0)]).cpu().double()
     points = points[torch.isfinite(points).all(-1)]
     if not bool((points != points[:1]).any()):
-        raise ValueError(f"region: expected (2, {ds.dim}) corners, as a latent length of {float(length)} implies none")
+        raise ValueError(
+            f"region: expected (2, {ds.dim}) corners, as a latent length of {float(frame.length)} implies none"
+        )
     low, high = points.amin(0), points.amax(0)
     margin = (0.25 * (high - low)).clamp(min=0.01 * float((high - low).max()))
     return torch.stack([low - margin, high + margin])

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,182 +15,134 @@ from .time_law import TimeLaw
 
 Array = NDArray[np.float64]
 
-UNIT = 1e-6
-"""How far from 1 the length of an axis may be: as far as that of one that was in float32 once."""
+
+class Frame(NamedTuple):
+    """Where latent motions end, and the line on which the demonstrated one comes from its start."""
+
+    attractor: Tensor
+    """x*, (n,)"""
+    axis: Tensor
+    """(n,) of length 1, from x* to the demonstrated start; 0 if they are one point"""
+    length: Tensor
+    """() their distance, > 0"""
+
+    @classmethod
+    def between(cls, start: Tensor, attractor: Tensor) -> Frame:
+        """Of the latent start and attractor, both (n,); their distance is taken for 1 if they are one point."""
+        offset = start - attractor
+        distance = torch.linalg.vector_norm(offset)
+        rounding = 64 * torch.finfo(offset.dtype).eps * attractor.detach().abs().amax()
+        length = distance + (distance <= rounding)
+        return cls(attractor, offset / length, length)
 
 
 class LatentDynamics(nn.Module, ABC):
-    """ẋ = g(x), globally asymptotically stable at ``attractor``; ‖x - x*‖² decreases along every motion."""
-
-    attractor: Tensor
-
-    def __init__(self, dim: int) -> None:
-        super().__init__()
-        self.register_buffer("attractor", torch.zeros(dim, dtype=torch.float64))
+    """ẋ = g(x), globally asymptotically stable at the frame's attractor; ‖x - x*‖² decreases along every motion."""
 
     @abstractmethod
-    def forward(self, x: Tensor, y: Tensor) -> Tensor:
+    def forward(self, x: Tensor, y: Tensor, frame: Frame) -> Tensor:
         """ẋ at x: (..., n) -> (..., n). ``y`` = ψ(x) is given for dynamics whose speed is a function of it."""
 
     @abstractmethod
-    def flow(self, x: Tensor, t: Tensor) -> Tensor:
+    def flow(self, x: Tensor, t: Tensor, frame: Frame) -> Tensor:
         """States at times ``t`` (T,), seconds since x: (..., n) -> (..., T, n)."""
 
-    def lyapunov(self, x: Tensor) -> Tensor:
+    def lyapunov(self, x: Tensor, frame: Frame) -> Tensor:
         """V = ‖x - x*‖²: (..., n) -> (...)."""
-        return (x - self.attractor).square().sum(-1)
+        return (x - frame.attractor).square().sum(-1)
 
-    def convergence_rate_bound(self, radius: float) -> float | None:
+    def convergence_rate_bound(self, radius: float, frame: Frame) -> float | None:
         """A lower bound on -V̇/(2V) within ``radius`` of x*, per second, that holds by construction; None if unknown.
 
         It is taken from the numbers that run; where they break what it rests on, it is not above 0.
         """
         return None
 
-    def check_buffers(self, buffers: Mapping[str, Tensor]) -> None:
-        """Refuse numbers for some of the buffers, by name, that no such dynamics can have: those of a file, say.
-
-        Raises:
-            ValueError: naming the buffer.
-        """
-
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        names = [name for name in self._buffers if prefix + name in state_dict]
-        try:
-            self.check_buffers({name: state_dict[prefix + name] for name in names})
-        except ValueError as error:
-            rest[-1].append(str(error))  # load_state_dict's list of what went wrong
-            return
-        super()._load_from_state_dict(state_dict, prefix, *rest)
-
-    def tables(self) -> tuple[Array, Array, Array] | None:
+    def tables(self, frame: Frame) -> tuple[Array, Array, Array] | None:
         """(goal, along, across) of :class:`latentds.deploy.tables.FieldTables`; None if it cannot be written so."""
         return None
 
 
 class RayDynamics(LatentDynamics):
-    """Straight to the goal: the direction of x - x* stays, its length over ``length`` follows ``law``.
+    """Straight to the goal: the direction of x - x* stays, its length over the frame's follows ``law``.
 
-    The paper's isotropic case. Attributes: ``length``, the distance of the demonstrated start from x*, > 0.
+    The paper's isotropic case.
     """
 
-    length: Tensor
-
-    def __init__(self, dim: int, law: TimeLaw) -> None:
-        super().__init__(dim)
+    def __init__(self, law: TimeLaw) -> None:
+        super().__init__()
         self.law = law
-        self.register_buffer("length", torch.ones((), dtype=torch.float64))
 
-    def set_endpoints(self, start: Tensor, attractor: Tensor) -> None:
-        """Set where the demonstration starts and ends in latent space, both (n,)."""
-        self.attractor.copy_(attractor)
-        self.length.copy_(torch.linalg.vector_norm(start.to(torch.float64) - attractor.to(torch.float64)))
-
-    def forward(self, x: Tensor, y: Tensor) -> Tensor:
-        offset = x - self.attractor
-        s = _off_zero(offset / self.length)
+    def forward(self, x: Tensor, y: Tensor, frame: Frame) -> Tensor:
+        offset = x - frame.attractor
+        s = _off_zero(offset / frame.length)
         return -(self.law.speed(s) / s) * offset
 
-    def flow(self, x: Tensor, t: Tensor) -> Tensor:
-        offset = (x - self.attractor).unsqueeze(-2)
-        return self.attractor + _shrink(self.law, _off_zero(offset / self.length), t) * offset
+    def flow(self, x: Tensor, t: Tensor, frame: Frame) -> Tensor:
+        offset = (x - frame.attractor).unsqueeze(-2)
+        return frame.attractor + _shrink(self.law, _off_zero(offset / frame.length), t) * offset
 
-    def convergence_rate_bound(self, radius: float) -> float:
-        length = float(self.length)
+    def convergence_rate_bound(self, radius: float, frame: Frame) -> float:
+        length = float(frame.length)
         return self.law.convergence_rate_bound(radius / length) if length > 0 else -math.inf
 
-    def check_buffers(self, buffers: Mapping[str, Tensor]) -> None:
-        check_positive(buffers, "length")
-
-    def tables(self) -> tuple[Array, Array, Array] | None:
+    def tables(self, frame: Frame) -> tuple[Array, Array, Array] | None:
         law = self.law.table() if type(self) is RayDynamics else None
-        return (
-            None
-            if law is None
-            else (_goal_table(self.attractor, torch.zeros_like(self.attractor), self.length), law, law)
-        )
+        return None if law is None else (_goal_table(frame._replace(axis=torch.zeros_like(frame.axis))), law, law)
 
 
 class TubeDynamics(LatentDynamics):
-    """Along the axis to the goal by ``law``, and across it inward at ``rate``: ṡ = -h(s), h odd, and ṗ = -κp.
+    """Along the axis to the goal by ``law``, and across it inward by ``transverse_law``, both odd: ṡ = -h(s).
 
-    With u the axis from x* to the demonstrated start and ``length`` their distance, s = u·(x - x*)/length and p is the
-    rest. Beyond ``radius`` from the axis the pull is held at κ·radius, so that a far start makes no wild speed.
-
-    Attributes:
-        axis: u, (n,).
-        length: distance of the demonstrated start from x*, > 0.
+    With the frame's axis u and length, s = u·(x - x*)/length and p is the rest. Beyond the last knot of
+    ``transverse_law`` from the axis the pull no longer grows, so that a far start makes no wild speed.
     """
 
-    axis: Tensor
-    length: Tensor
-
-    def __init__(self, dim: int, law: TimeLaw, transverse_law: TimeLaw) -> None:
-        super().__init__(dim)
+    def __init__(self, law: TimeLaw, transverse_law: TimeLaw) -> None:
+        super().__init__()
         self.law = law
         self.transverse_law = transverse_law
-        self.register_buffer("axis", torch.eye(dim, dtype=torch.float64)[0])
-        self.register_buffer("length", torch.ones((), dtype=torch.float64))
 
-    def set_endpoints(self, start: Tensor, attractor: Tensor) -> None:
-        """Set where the demonstration starts and ends in latent space, both (n,)."""
-        self.attractor.copy_(attractor)
-        offset = start.to(torch.float64) - attractor.to(torch.float64)
-        self.length.copy_(torch.linalg.vector_norm(offset))
-        self.axis.copy_(offset / torch.linalg.vector_norm(offset))
-
-    def forward(self, x: Tensor, y: Tensor) -> Tensor:
-        along, across = self._split(x)
+    def forward(self, x: Tensor, y: Tensor, frame: Frame) -> Tensor:
+        along, across = _split(x, frame)
         s, p = _off_zero(along), _off_zero(across)
-        inward = self.law.speed(s) / s * along * self.axis + self.transverse_law.speed(p) / p * across
-        return -self.length * inward
+        inward = self.law.speed(s) / s * along * frame.axis + self.transverse_law.speed(p) / p * across
+        return -frame.length * inward
 
-    def flow(self, x: Tensor, t: Tensor) -> Tensor:
-        along, across = (part.unsqueeze(-2) for part in self._split(x))
-        left = _shrink(self.law, _off_zero(along), t) * along * self.axis
-        return self.attractor + self.length * (left + _shrink(self.transverse_law, _off_zero(across), t) * across)
+    def flow(self, x: Tensor, t: Tensor, frame: Frame) -> Tensor:
+        along, across = (part.unsqueeze(-2) for part in _split(x, frame))
+        left = _shrink(self.law, _off_zero(along), t) * along * frame.axis
+        return frame.attractor + frame.length * (left + _shrink(self.transverse_law, _off_zero(across), t) * across)
 
-    def convergence_rate_bound(self, radius: float) -> float:
-        length, dtype = float(self.length), self.axis.dtype
-        unit = abs(float(torch.linalg.vector_norm(self.axis.to(torch.float64))) - 1) <= 8 * torch.finfo(dtype).eps
-        if not (length > 0 and unit):  # by an axis that is longer, what lies along it would also be pushed back
+    def convergence_rate_bound(self, radius: float, frame: Frame) -> float:
+        length, dtype = float(frame.length), frame.axis.dtype
+        norm = float(torch.linalg.vector_norm(frame.axis.to(torch.float64)))
+        # by an axis that is longer, what lies along it would also be pushed back
+        if not (length > 0 and (norm == 0 or abs(norm - 1) <= 8 * torch.finfo(dtype).eps)):
             return -math.inf
         reach = radius / length
         return min(self.law.convergence_rate_bound(reach), self.transverse_law.convergence_rate_bound(reach))
 
-    def check_buffers(self, buffers: Mapping[str, Tensor]) -> None:
-        check_positive(buffers, "length")
-        if (axis := buffers.get("axis")) is not None:
-            norm = float(torch.linalg.vector_norm(axis.to(self.axis.dtype).to(torch.float64)))
-            if not abs(norm - 1) <= max(UNIT, 4 * torch.finfo(self.axis.dtype).eps):
-                raise ValueError(f"axis: expected a vector of length 1, got one of length {norm:.9g}")
-
-    def phase(self, x: Tensor) -> Tensor:
+    def phase(self, x: Tensor, frame: Frame) -> Tensor:
         """s, 1 at the demonstrated start and 0 at x*: (..., n) -> (...)."""
-        return self._split(x)[0].squeeze(-1)
+        return _split(x, frame)[0].squeeze(-1)
 
-    def tables(self) -> tuple[Array, Array, Array] | None:
+    def tables(self, frame: Frame) -> tuple[Array, Array, Array] | None:
         along, across = self.law.table(), self.transverse_law.table()
         if type(self) is not TubeDynamics or along is None or across is None:
             return None
-        return _goal_table(self.attractor, self.axis, self.length), along, across
-
-    def _split(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Offset from x* in units of length: along the axis (..., 1) and across it (..., n)."""
-        offset = (x - self.attractor) / self.length
-        along = (offset * self.axis).sum(-1, keepdim=True)
-        return along, offset - along * self.axis
+        return _goal_table(frame), along, across
 
 
-def check_positive(buffers: Mapping[str, Tensor], *names: str) -> None:
-    """Refuse buffers of these names that are not above 0."""
-    for name in names:
-        if name in buffers and not bool((buffers[name] > 0).all()):
-            raise ValueError(f"{name}: expected a number > 0, got {buffers[name].tolist()}")
+def _split(x: Tensor, frame: Frame) -> tuple[Tensor, Tensor]:
+    """Offset from x* in units of length: along the axis (..., 1) and across it (..., n)."""
+    offset = (x - frame.attractor) / frame.length
+    along = (offset * frame.axis).sum(-1, keepdim=True)
+    return along, offset - along * frame.axis
 
 
-def _goal_table(attractor: Tensor, axis: Tensor, length: Tensor) -> Array:
-    rows = torch.stack([attractor, axis, length.expand_as(attractor)])
+def _goal_table(frame: Frame) -> Array:
+    rows = torch.stack([frame.attractor, frame.axis, frame.length.expand_as(frame.axis)])
     return rows.detach().to("cpu", torch.float64, copy=True).numpy()
 
 

@@ -73,8 +73,8 @@ def _rebuilt(text: str, state: dict[str, torch.Tensor], known: dict[str, type[St
     with torch.random.fork_rng(devices=[]):  # an unseeded constructor draws numbers, only to have them replaced
         ds = known[told["class"]](**settings)
     dtype = state["attractor"].dtype
-    if dtype not in (torch.float64, torch.float32, torch.float16, torch.bfloat16):
-        raise ValueError(f"expected a floating attractor, got {dtype}")
+    if dtype not in (torch.float64, torch.float32):
+        raise ValueError(f"expected an attractor in float64 or float32, got {dtype}")
     ds.to(dtype).load_state_dict(state)
     ds.fit_report = None if told["report"] is None else _typed(told["report"], ds.report_type, "report")
     return ds

@@ -53,13 +53,16 @@ class CellStore:
             self._connection = sqlite3.connect(self.path, timeout=60, isolation_level=None)
         except sqlite3.DatabaseError as error:
             raise self._refusal(error) from None
-        ours = self._execute("PRAGMA application_id")[0][0] == _APPLICATION
-        if not ours and self._execute("SELECT 1 FROM sqlite_master"):
+        # Asked again after its tables were seen: another process that makes the file sets the number first.
+        if not self._is_ours() and self._execute("SELECT 1 FROM sqlite_master") and not self._is_ours():
             raise self._refusal("a database of another kind")
         self._execute("PRAGMA journal_mode = WAL")
         self._execute(f"PRAGMA application_id = {_APPLICATION}")
         self._execute(_SCHEMA)
         self._execute("SELECT key, method, demonstration, seed, rows, paths, digest FROM cells LIMIT 0")
+
+    def _is_ours(self) -> bool:
+        return bool(self._execute("PRAGMA application_id")[0][0] == _APPLICATION)
 
     def _execute(self, command: str, values: tuple[Any, ...] = ()) -> list[Any]:
         try:

@@ -134,3 +134,39 @@ def test_writers_and_readers_at_once_see_whole_files(tmp_path):
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(exchange, range(200)))
     assert os.listdir(tmp_path) == ["a"]
+
+
+@pytest.fixture
+def leftovers(tmp_path):
+    """Of two other processes of this machine."""
+    paths = {process: tmp_path / f".a.{process}@{platform.node()}.{'0' * 16}" for process in (11, 12)}
+    for path in paths.values():
+        path.write_text("theirs")
+    return paths
+
+
+def test_what_another_user_is_writing_is_left_alone(tmp_path, monkeypatch, leftovers):
+    """The system tells nobody to signal another's process; that it does tells that there is one."""
+
+    def refuse(process, signal):
+        raise PermissionError
+
+    monkeypatch.setattr("os.kill", refuse)
+    write(tmp_path / "a", "new")
+    assert sorted(os.listdir(tmp_path)) == sorted(["a", *(path.name for path in leftovers.values())])
+
+
+def test_two_that_tidy_up_at_once_do_not_stop_each_other(tmp_path, monkeypatch, leftovers):
+    """Whichever comes first here, somebody else has just removed it."""
+    asked = []
+
+    def answer(process, signal):
+        asked.append(process)
+        if len(asked) == 1:
+            leftovers[process].unlink()
+        raise ProcessLookupError
+
+    monkeypatch.setattr("os.kill", answer)
+    write(tmp_path / "a", "new")
+    assert sorted(asked) == [11, 12]
+    assert os.listdir(tmp_path) == ["a"]

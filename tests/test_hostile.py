@@ -112,7 +112,6 @@ def ds(request):
     with torch.no_grad():
         for parameter in system.diffeomorphism.parameters():
             parameter.normal_(0, 0.02, generator=torch.Generator().manual_seed(0))
-        system.dynamics.attractor.copy_(system.encode(system.attractor))
     return system
 
 

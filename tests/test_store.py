@@ -494,17 +494,38 @@ def test_ctrl_c_ends_with_what_is_done(file):
     code = f"""
 from experiments import kill
 try: kill.work({str(file)!r}, 2, 60)
-except KeyboardInterrupt: print("interrupted")"""
+except KeyboardInterrupt: print("interrupted", flush=True)
+else: print("ran to its end", flush=True)"""
+    # A shell's background jobs ignore SIGINT, and their children with them; a terminal's do not.
     child = subprocess.Popen(
-        [sys.executable, "-c", code], start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        [sys.executable, "-c", code],
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     kill._wait_for_more_than(3, file, child)
     os.killpg(child.pid, signal.SIGINT)  # as a terminal does
     began = time.monotonic()
     out, err = child.communicate(timeout=60)
-    assert out == b"interrupted\n", err
+    assert out == b"interrupted\n", (child.returncode, err)
     idle = err.count(b"Process LokyProcess")  # joblib's own workers between two cells may tell where they were hit
     assert err.count(b"Traceback") == idle, err
     assert time.monotonic() - began < 30
     with CellStore(file) as store:
         assert 3 < len(store) < len(kill.cells(60))
+
+
+def test_this_librarys_code_counts_once_and_for_all(monkeypatch):
+    """For what comes from it and for what does not."""
+    things = (1.5, ChebyshevDS(2, n_layers=2), FDM(2, n_layers=2))
+    before = [fingerprint(thing) for thing in things]
+    known, ours = store._package, str(Path(store.__file__).parent)
+    monkeypatch.setattr(store, "_package", lambda folder: b"edited" if folder == ours else known(folder))
+    assert all(was != fingerprint(thing) for was, thing in zip(before, things, strict=True))
+
+
+def test_a_store_takes_no_pickles(file):
+    row = {"method": "a", "demonstration": "b", "seed": 0}
+    with CellStore(file) as store, pytest.raises(ValueError, match="Object arrays cannot be saved"):
+        store.put("key", (row,), np.array([None]))

@@ -59,7 +59,7 @@ class Latent(LatentDS):
 
     def __init__(self, dim):
         psi = LocallyWeightedTranslations(dim, 2)
-        super().__init__(dim, psi, RayDynamics(dim, PiecewiseLinearLaw.uniform()))
+        super().__init__(dim, psi, RayDynamics(PiecewiseLinearLaw.uniform()))
 
     def fit(self, demonstration, *, progress=False):
         shown = only_demonstration(demonstration, self.dim, "Latent")
@@ -67,8 +67,7 @@ class Latent(LatentDS):
         centers = torch.stack([shown.start, shown.goal])
         psi.assign(centers, torch.full_like(centers, 0.1 * shown.size), torch.full((2,), 1.5 / shown.size))
         self.attractor.copy_(shown.goal)
-        with torch.no_grad():
-            self.dynamics.set_endpoints(psi.inverse(shown.start), psi.inverse(shown.goal))
+        self.start.copy_(shown.start)
         self.fit_report = FitReport(0.0, 2, 0.0)
         return self
 
@@ -305,7 +304,7 @@ class HasNoVelocitySomewhere(Plain):
 class KeepsAFloat32Attractor(Plain):
     def __init__(self, dim):
         super().__init__(dim)
-        self.attractor = self.attractor.float()
+        self.register_buffer("attractor", self.attractor.float())
 
 
 class AnswersAnyDimension(Plain):
@@ -328,12 +327,37 @@ class ForgetsInARefusedFit(Plain):
         return super().fit(demonstration)
 
 
+class RemembersItsLatentAttractor(Latent):
+    """What its frame was at first, whatever the map has become."""
+
+    def __init__(self, dim):
+        super().__init__(dim)
+        self.known = super().frame()
+
+    def fit(self, demonstration, *, progress=False):
+        super().fit(demonstration)
+        with torch.no_grad():
+            self.known = super().frame()
+        return self
+
+    def _linearize(self, y):
+        return *super()._linearize(y)[:2], self.known
+
+
+class ReportsTooEarly(Plain):
+    def fit(self, demonstration, *, progress=False):
+        super().fit(demonstration)
+        with torch.no_grad():
+            self.rate *= 2
+        return self
+
+
 class KeepsAView(Plain):
     """The attractor lies in the demonstration's memory."""
 
     def fit(self, demonstration, *, progress=False):
         super().fit(demonstration)
-        self.attractor = demonstration.goal
+        self.register_buffer("attractor", demonstration.goal)
         return self
 
 
@@ -444,6 +468,8 @@ BROKEN = {
     CannotBePickled: "check_serialization: pickle",
     ReturnsNothing: "check_report: return self",
     LeavesNoReport: "check_report: fit_report",
+    RemembersItsLatentAttractor: "check_training: speed",
+    ReportsTooEarly: "check_report: set it last",
     KeepsAView: "check_memory: attractor after the demonstration was changed",
     ChangesTheDemonstration: "check_memory: the demonstration after fit",
     RemembersTheLastFit: "check_repeatability: refit",

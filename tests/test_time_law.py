@@ -9,7 +9,7 @@ import pytest
 import torch
 from scipy.integrate import quad, solve_ivp
 
-from latentds.dynamics import RayDynamics
+from latentds.dynamics import Frame, RayDynamics
 from latentds.time_law import TAIL, ChebyshevLaw, PiecewiseLinearLaw
 
 
@@ -107,18 +107,18 @@ def test_a_law_that_breaks_its_own_rules_does_not_load():
 
 @pytest.mark.parametrize("dim", [1, 3])
 def test_rays_go_straight_to_the_goal(law, dim, draw):
-    dynamics = RayDynamics(dim, law)
+    dynamics = RayDynamics(law)
     goal, start = torch.randn(2, dim, generator=draw, dtype=torch.float64)
-    dynamics.set_endpoints(start, goal)
+    frame = Frame.between(start, goal)
     x = goal + torch.randn(6, dim, generator=draw, dtype=torch.float64)
     times = torch.linspace(0, 1, 5, dtype=torch.float64)
-    path = dynamics.flow(x, times)
+    path = dynamics.flow(x, times, frame)
     torch.testing.assert_close(path[:, 0], x, rtol=1e-12, atol=1e-12)
     share = (path - goal).norm(dim=-1, keepdim=True) / (x - goal).norm(dim=-1, keepdim=True).unsqueeze(1)
     torch.testing.assert_close(path - goal, share * (x - goal).unsqueeze(1), rtol=0, atol=1e-12)
-    assert (dynamics.lyapunov(path).diff(dim=-1) < 0).all()
+    assert (dynamics.lyapunov(path, frame).diff(dim=-1) < 0).all()
     solved = solve_ivp(
-        lambda _, x: dynamics(torch.from_numpy(x).view(6, dim), torch.zeros(6, dim)).reshape(-1).numpy(),
+        lambda _, x: dynamics(torch.from_numpy(x).view(6, dim), torch.zeros(6, dim), frame).reshape(-1).numpy(),
         (0, 1),
         x.numpy().ravel(),
         "LSODA",
@@ -127,8 +127,8 @@ def test_rays_go_straight_to_the_goal(law, dim, draw):
         atol=1e-12,
     )
     assert np.abs(solved.y.T.reshape(5, 6, dim).swapaxes(0, 1) - path.numpy()).max() < 1e-6
-    assert (dynamics(goal, goal) == 0).all()
-    torch.testing.assert_close(dynamics.flow(goal, times), goal.expand(5, dim), rtol=0, atol=0)
+    assert (dynamics(goal, goal, frame) == 0).all()
+    torch.testing.assert_close(dynamics.flow(goal, times, frame), goal.expand(5, dim), rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("value", [0, -1.0, float("nan"), float("inf"), "long", None])

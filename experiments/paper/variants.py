@@ -39,12 +39,11 @@ class Variant(LatentDS):
         self.fit_report = self.base.fit(shown).fit_report
         if self.contraction is not None:
             across = PiecewiseLinearLaw(torch.ones(1), torch.tensor([self.contraction / shown.duration]))
-            self.dynamics = TubeDynamics(self.dim, self.base.dynamics.law, across)
+            self.dynamics = TubeDynamics(self.base.dynamics.law, across)
         with torch.no_grad():
             # The latent line runs from the start to the goal themselves, so x_N is the goal.
-            attractor = shown.goal if self.printed else self.encode(shown.goal)
-            self.dynamics.set_endpoints(self.encode(shown.start), attractor)
-            self.attractor.copy_(self.decode(attractor))
+            self.attractor.copy_(self.decode(shown.goal) if self.printed else shown.goal)
+            self.start.copy_(shown.start)
         return self
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..diffeomorphism import Diffeomorphism
-from ..dynamics import LatentDynamics
+from ..dynamics import Frame, LatentDynamics
 
 Array = NDArray[np.float64]
 Self = TypeVar("Self", bound="VelocityField")
@@ -40,7 +40,7 @@ class VelocityField(Protocol):
     def requires_grad_(self: Self, requires_grad: bool = True) -> Self: ...
 
 
-def field_tables(psi: Diffeomorphism, dynamics: LatentDynamics) -> FieldTables | None:
+def field_tables(psi: Diffeomorphism, dynamics: LatentDynamics, frame: Frame) -> FieldTables | None:
     """The field J_ψ(x) g(x), x = ψ⁻¹(y), as arrays; None where one of the two cannot be written so."""
-    layers, moves = psi.layer_table(), dynamics.tables()
+    layers, moves = psi.layer_table(), dynamics.tables(frame)
     return None if layers is None or moves is None else FieldTables(layers, *moves)

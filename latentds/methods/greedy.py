@@ -56,7 +56,7 @@ class GreedyDS(LatentDS):
     ) -> None:
         self.n_layers = whole_number(n_layers, "n_layers", at_least=1)
         psi = LocallyWeightedTranslations(dim, self.n_layers + PINS * bool(pinned))
-        super().__init__(dim, psi, RayDynamics(dim, self.time_law(1.0)))
+        super().__init__(dim, psi, RayDynamics(self.time_law(1.0)))
         self.beta = number_in(beta, "beta", 0, 1, ends="(]")
         self.mu = number_in(mu, "mu", 0, 1)
         self.steps = whole_number(steps, "steps", at_least=1)
@@ -89,8 +89,7 @@ class GreedyDS(LatentDS):
             self.dynamics.law = self.time_law(shown.duration).to(self.attractor)
             with torch.no_grad():
                 self.attractor.copy_(shown.goal)
-                start = shown.start.to(self.attractor)
-                self.dynamics.set_endpoints(psi.inverse(start), psi.inverse(self.attractor))
+                self.start.copy_(shown.start)
                 missed = psi(torch.from_numpy(latent).to(self.attractor)) - shown.positions.to(self.attractor)
             mse, seconds = float(missed.square().mean()), time.perf_counter() - began
             self.fit_report = FitReport(mse, psi.n_layers, seconds, learned_from=(shown.fingerprint,))

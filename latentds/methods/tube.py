@@ -111,7 +111,7 @@ class TubeDS(LatentDS):
         homotopy: str = "both",
     ) -> None:
         along, across = PiecewiseLinearLaw.uniform(), PiecewiseLinearLaw(torch.ones(1), torch.ones(1))
-        super().__init__(dim, LocallyWeightedTranslations(dim, n_layers), TubeDynamics(dim, along, across))
+        super().__init__(dim, LocallyWeightedTranslations(dim, n_layers), TubeDynamics(along, across))
         self.n_layers = self.diffeomorphism.n_layers
         self.contraction = number_in(contraction, "contraction", 0, float("inf"))
         self.refined = bool(refined)
@@ -153,12 +153,11 @@ class TubeDS(LatentDS):
 
     @torch.no_grad()
     def _take(self, candidate: Candidate, shown: Demonstration, law: PiecewiseLinearLaw) -> None:
-        """Take a match, and lay the dynamics from the encoded start to the encoded goal."""
+        """Take a match, and the dynamics for it."""
         self.diffeomorphism.assign(*(torch.from_numpy(part) for part in candidate.layers))
         self.attractor.copy_(shown.goal)
-        start = shown.start.to(self.attractor)
-        self.dynamics.set_endpoints(self.diffeomorphism.inverse(start), self.diffeomorphism.inverse(self.attractor))
-        far = torch.as_tensor(FAR * shown.size) / self.dynamics.length.cpu()
+        self.start.copy_(shown.start)
+        far = torch.as_tensor(FAR * shown.size) / self.frame().length.cpu()
         self.dynamics.law = law.to(self.attractor)
         transverse = PiecewiseLinearLaw(far.reshape(1), (far * self.contraction / shown.duration).reshape(1))
         self.dynamics.transverse_law = transverse.to(self.attractor)
@@ -173,7 +172,7 @@ class TubeDS(LatentDS):
         times, step = np.linspace(0, shown.duration, ROWS, retstep=True)
         paths = self.rollout(starts, torch.from_numpy(times)).cpu().numpy()
         # Which fraction of a step a start is ahead is chance, and would drown the rest where steps are long.
-        share = self.dynamics.phase(self.encode(starts)).abs()
+        share = self.dynamics.phase(self.encode(starts), self.frame()).abs()
         left = self.dynamics.law.time_to_go(share).cpu().numpy()
         ahead = (left[0] - left) / step
         clocks = times + step * (ahead - ahead.round())[:, None]
@@ -186,14 +185,15 @@ class TubeDS(LatentDS):
     def _line(self) -> Tensor:
         """Latent points from the encoded start to x*, one for each of the path, (N_POINTS, n)."""
         share = torch.linspace(1, 0, N_POINTS, dtype=self.attractor.dtype, device=self.attractor.device)
-        return self.dynamics.attractor + share.unsqueeze(-1) * self.dynamics.length * self.dynamics.axis
+        frame = self.frame()
+        return frame.attractor + share.unsqueeze(-1) * frame.length * frame.axis
 
     @torch.no_grad()
     def _report(
         self, best: Candidate, path: Array, shown: Demonstration, spread: tuple[float, ...], began: float
     ) -> TubeReport:
-        line = self._line()
-        across = torch.linalg.svd(self.dynamics.axis.unsqueeze(-1))[0][:, 1:].T * TUBE * self.dynamics.length
+        line, frame = self._line(), self.frame()
+        across = torch.linalg.svd(frame.axis.unsqueeze(-1))[0][:, 1:].T * TUBE * frame.length
         tube = torch.cat([line, *(line[::4] + side * offset for offset in across for side in (1, -1))])
         missed = torch.linalg.vector_norm(self.diffeomorphism(line).cpu() - torch.from_numpy(path), dim=-1).mean()
         y = self.diffeomorphism(tube)

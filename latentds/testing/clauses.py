@@ -97,6 +97,28 @@ def check_convergence(case: Case) -> None:
     raise AssertionError(f"a rollout from {case.starts[worst].tolist()} is still {float(left[worst]):.3g} away")
 
 
+def check_training(case: Case) -> None:
+    """Whatever its parameters become, a LatentDS rests at its attractor and its motions end there, to 1e-9."""
+    if not isinstance(case.ds, LatentDS):
+        return
+    ds, draw = copy.deepcopy(case.ds), torch.Generator().manual_seed(case.seed)
+    goal, size, y = ds.attractor.clone(), case.shown.size, case.starts
+    with torch.no_grad():
+        for parameter in ds.parameters():
+            noise = torch.randn(parameter.shape, generator=draw, dtype=torch.float64).to(parameter)
+            parameter.add_(0.05 * (1 + parameter.abs().mean()) * noise)
+        same(ds.attractor, goal, "attractor after the parameters changed", relative=0)
+        for what, call in {"speed": lambda y: torch.linalg.vector_norm(ds(y), dim=-1), "V": ds.lyapunov}.items():
+            there, elsewhere = float(call(goal)), float(call(case.probes).max())
+            expect(abs(there) <= 1e-9 * elsewhere, f"{what} {there:.3g} at the attractor, {elsewhere:.3g} elsewhere")
+        for doubling in range(24):
+            y = ds.rollout(y, torch.tensor([0.0, case.shown.duration * 2.0**doubling], dtype=torch.float64))[:, -1]
+            left = float(torch.linalg.vector_norm(y - goal, dim=-1).max())
+            if left < 1e-9 * size:
+                return
+    raise AssertionError(f"a motion ends {left:.3g} away from the attractor")
+
+
 def check_flow(case: Case) -> None:
     """rollout is the flow of forward: it agrees with scipy's solve_ivp."""
     ds, starts = case.ds, case.starts[:3]
@@ -242,6 +264,7 @@ def check_report(case: Case) -> None:
     assert report is not None
     expect(math.isfinite(report.mse) and report.mse >= 0, f"fit_report.mse is {report.mse}")
     expect(report.n_layers >= 0 and report.seconds >= 0, f"fit_report: {report}")
+    expect(case.ds.fit_report_is_current, "fit_report was set before the system was as it is now: set it last")
 
 
 def check_memory(case: Case) -> None:
@@ -287,6 +310,7 @@ CLAUSES: tuple[Clause, ...] = (
     check_equilibrium,
     check_descent,
     check_convergence,
+    check_training,
     check_flow,
     check_inverse,
     check_jacobian,

@@ -10,7 +10,13 @@ import pytest
 from numpy.polynomial import Chebyshev
 from scipy.linalg import eigh
 
-from latentds.fitting.embedding import chebyshev_columns, chebyshev_eigenvalues, map_to_endpoints, straight_column
+from latentds.fitting.embedding import (
+    arc_length_path,
+    chebyshev_columns,
+    chebyshev_eigenvalues,
+    map_to_endpoints,
+    straight_column,
+)
 
 
 def laplacian(n_points, copies):
@@ -116,3 +122,52 @@ def test_bad_input(n_points, dim, name):
         chebyshev_eigenvalues(n_points, dim)
     with pytest.raises(ValueError, match=f"{name}: expected a whole number"):
         chebyshev_columns(n_points, dim)
+
+
+def test_only_the_order_of_a_column_counts_not_its_scale():
+    start, goal = np.array([1.0, -2.0]), np.array([3.0, 5.0])
+    for columns in (straight_column(50), chebyshev_columns(50, 2)[::-1]):
+        np.testing.assert_allclose(
+            map_to_endpoints(7 - 3 * columns, start, goal), map_to_endpoints(columns, start, goal), rtol=0, atol=1e-12
+        )
+    assert straight_column(50)[[0, -1]].tolist() == [[0], [1]]
+
+
+def test_without_noise_every_point_that_moves_counts():
+    """Told exactly by a line: steps of a thousandth of its length are path, a tenth of that is not."""
+    line = np.linspace(2, 3, 1001)
+    path, way, times = arc_length_path(np.stack([line, 0 * line], 1), np.linspace(5, 6, 1001), 11)
+    np.testing.assert_allclose(path, np.stack([np.linspace(2, 3, 11), np.zeros(11)], 1), atol=1e-12)
+    np.testing.assert_allclose(way, np.linspace(1, 0, 1001), atol=1e-12)
+    np.testing.assert_allclose(times, np.linspace(0, 1, 1001), atol=1e-12)
+    finer = np.linspace(2, 3, 10001)
+    way = arc_length_path(np.stack([finer, 0 * finer], 1), np.linspace(0, 1, 10001), 11)[1]
+    assert 1000 < len(way) <= 2001
+    assert np.abs(np.diff(way)[:-1]).min() > 5e-4
+
+
+@pytest.mark.parametrize("noise", [5e-4, 1e-3])
+def test_steps_within_the_noise_are_no_path(noise):
+    """The noise is that of one coordinate; nothing but it is known to be smaller than a step."""
+    line = np.linspace(0, 1, 5000)
+    shown = np.stack([line, line**2], 1) + noise * np.random.default_rng(0).standard_normal((5000, 2))
+    path, way, _ = arc_length_path(shown, line, 5000)
+    assert np.abs(np.diff(way)[:-1]).min() * np.linalg.norm(np.diff(path, axis=0), axis=1).sum() > 2 * noise
+
+
+def test_a_motion_that_dithers_before_its_goal_ends_with_a_whole_step():
+    """The last but one lies a fifth of the least step from the goal, and no velocity is to be read off that."""
+    line = np.array([*np.arange(10) / 10, 1 - 1e-4, 1 - 5.5e-4, 1.0])
+    _, way, times = arc_length_path(line[:, None], np.arange(13.0), 5)
+    np.testing.assert_allclose(way, np.linspace(1, 0, 11), atol=1e-12)
+    assert times.tolist() == [*range(10), 12]
+
+
+@pytest.mark.parametrize("rest", [1, 2, 7])
+@pytest.mark.parametrize("moving", [10, 11])
+def test_a_rest_at_the_goal_takes_no_time(rest, moving):
+    line = np.concatenate([np.linspace(0, 1, moving), np.ones(rest)])
+    clock = np.arange(len(line)) * 0.5
+    _, way, times = arc_length_path(np.stack([line, 3 - line], 1), clock, 5)
+    np.testing.assert_allclose(way, np.linspace(1, 0, moving), atol=1e-12)
+    assert times.tolist() == clock[:moving].tolist()

@@ -13,7 +13,8 @@ from baselines import FDM
 from latentds import ChebyshevDS, Demonstration, TubeDS, datasets
 from latentds.diffeomorphism import WIDTH_BOUND
 from latentds.fitting.embedding import chebyshev_columns, map_to_endpoints, straight_column
-from latentds.fitting.matching import PINS, match, pin_ends
+from latentds.fitting.homotopy import linear_homotopy
+from latentds.fitting.matching import PINS, match, match_along, pin_ends
 from latentds.testing import wavy_motion
 
 # Table I of the paper: complexity -> (beta, mu, layers, MSE per coordinate).
@@ -121,7 +122,7 @@ def test_attractor_is_the_end_of_the_demonstration(method, dim):
         end = ds.rollout(shown.start, torch.tensor([0.0, 100 * shown.duration]))[-1]
         assert (ds.attractor - shown.goal).abs().max() < 1e-9
         assert (end - shown.goal).abs().max() < 1e-9
-        assert (ds.decode(ds.dynamics.attractor) - shown.goal).abs().max() < 1e-9
+        assert (ds.decode(ds.frame().attractor) - shown.goal).abs().max() < 1e-9
 
 
 @pytest.mark.parametrize("c", [7, 15])
@@ -214,3 +215,30 @@ def test_a_map_that_floats_cannot_invert_is_refused(monkeypatch):
         ds.fit(wavy_motion(2))
     assert ds.fit_report is None
     assert bool((ds.attractor == 0).all())
+
+
+@pytest.mark.parametrize(("n_layers", "steps"), [(40, 4), (41, 4), (20, 1), (7, 5)])
+def test_continuation_matches_curve_after_curve(n_layers, steps):
+    """Half of the layers shared evenly, the last curve takes the rest: the same, one call after the other."""
+    x, y = pair(wavy_motion(2), straight_column(len(wavy_motion(2))))
+    curves = linear_homotopy(x, y, steps)
+    share = n_layers // (2 * steps)
+    expected = []
+    for target, count in zip(curves[1:], [share] * (steps - 1) + [n_layers - share * (steps - 1)], strict=True):
+        if count:
+            layers = match(x, target, count, 0.5, 0.9)
+            for c, v, rho in zip(*layers, strict=True):
+                x = moved_by(x, c, v, rho)
+            expected.append(layers)
+    found = match_along(curves, n_layers, 0.5, 0.9)
+    for part, wanted in zip(found, zip(*expected, strict=True), strict=True):
+        np.testing.assert_allclose(part, np.concatenate(wanted), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("narrowest", [0.05, 0.3, 2.0])
+def test_no_layer_is_narrower_than_asked(narrowest):
+    x, y = pair(wavy_motion(2), straight_column(len(wavy_motion(2))))
+    free = match_along(linear_homotopy(x, y, 2), 30, 0.5, 0.9)
+    bound = match_along(linear_homotopy(x, y, 2), 30, 0.5, 0.9, narrowest)
+    assert (1 / free.widths).min() < narrowest  # else the bound would not be felt
+    assert (1 / bound.widths).min() >= narrowest * (1 - 1e-12)

@@ -127,3 +127,13 @@ def test_nothing_to_refine():
     layers = match(x, y, 5, 0.5, 0.9)
     same = refine(layers, x, decode(layers, x), 0.9)
     np.testing.assert_allclose(decode(same, x), decode(layers, x), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_a_layer_that_was_planted_is_found(dim):
+    """The least error is 0 here, so that stopping early shows."""
+    x = np.random.default_rng(dim).uniform(-1, 1, (80, dim))
+    planted = Layers(np.full((1, dim), 0.2), np.full((1, dim), 0.3), np.array([0.7]))
+    y = decode(planted, x)
+    nearby = Layers(planted.centers + 0.1, planted.directions * 0.8, planted.widths * 1.1)
+    assert mse(refine(nearby, x, y, 0.95), x, y) < 1e-8 * mse(nearby, x, y)
