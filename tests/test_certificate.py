@@ -265,7 +265,6 @@ def test_counterexample_of_the_bound_is_where_space_folds():
     assert np.isfinite(line.counterexample).all()
 
 
-@pytest.mark.slow
 class Vinograd(StableDS):
     """Attractive and unstable (Vinograd 1957; Hahn, Stability of Motion, section 40): all motions end at 0, and from
     as near as one likes some go far first. No V proves it stable; this one does not even try.
