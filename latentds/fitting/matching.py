@@ -94,7 +94,7 @@ def restore_on_failure(ds: LatentDS, shown: Demonstration) -> Iterator[None]:
     Invertible on paper is not invertible in floats: a map that does not lead back is refused, and one under which the
     motion from the demonstrated start, begun anew half-way, is another one.
     """
-    gap = goal_apart(shown)
+    gap = goal_apart(shown, shown.goal)
     before, report = {name: value.clone() for name, value in ds.state_dict().items()}, ds.fit_report
     try:
         yield
