@@ -31,10 +31,12 @@ from latentds import ChebyshevDS, Demonstration, FitWarning, StableDS, TubeDS, c
 from latentds.certificate import Line
 from latentds.fidelity import MISS
 
+SLOW = "SDS-EF"
+"""Learns by gradient, so it gets a third of the others' cases."""
 METHODS: dict[str, Callable[[int], StableDS]] = {
     "ChebyshevDS": lambda dim: ChebyshevDS(dim, n_layers=40),
     "FDM": lambda dim: FDM(dim, n_layers=40),
-    "SDS-EF": lambda dim: SDSEF(dim, n_layers=3, n_features=30, seed=0, epochs=100),
+    SLOW: lambda dim: SDSEF(dim, n_layers=3, n_features=30, seed=0, epochs=100),
     "TubeDS": lambda dim: TubeDS(dim, n_layers=40, refined=False),
 }
 SHAPES = (
@@ -199,7 +201,7 @@ def cases(largest: int = 5000) -> st.SearchStrategy[Case]:
     counts = st.one_of(st.integers(3, 12), st.integers(13, 300), st.integers(301, max(301, largest)))
     return st.builds(
         Case,
-        st.sampled_from(sorted(METHODS)),
+        st.sampled_from([name for name in sorted(METHODS) for _ in range(1 if name == SLOW else 3)]),
         st.sampled_from(SHAPES),
         st.sampled_from(FLAWS),
         st.sampled_from(FORMS),
