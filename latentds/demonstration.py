@@ -211,7 +211,7 @@ class Demonstration:
             raise ValueError(f"path: expected a .npz or .csv file, got {path.name!r}")
         with files.atomic_write(path) as file:
             if path.suffix == ".npz":
-                named = {"columns": np.array(self.columns)} if self.columns else {}
+                named: dict[str, Any] = {"columns": np.array(self.columns)} if self.columns else {}
                 np.savez(file, positions=self.positions.numpy(), dt=self.dt, name=self.name, **named)
             else:
                 columns = ["t [s]", *(f"y{i}" for i in range(self.dim))]

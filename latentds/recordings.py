@@ -167,9 +167,10 @@ class _Reading:
         self, columns: str | int | Sequence[str | int] | None, time: str | int | None, unit: str | None, dt: Any
     ) -> Motion:
         if unit is not None:
-            if unit.replace("µ", "u").replace("μ", "u") not in UNITS:
+            known = UNIT_WORDS.get(unit) if isinstance(unit, str) else None
+            if known is None:
                 raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
-            unit = unit.replace("µ", "u").replace("μ", "u")
+            unit = known
         if dt is not None:
             dt = positive(dt, "dt")
             if time is not None or unit is not None:
@@ -268,11 +269,10 @@ class _Reading:
         if len(blocks) > 1 and not one_state and not (pose and len({len(c.values) for c in found}) == 1):
             self._ask("columns", f"expected one set of positions, got {self._shapes(blocks)}")
         plain = Counter(tuple(w for w in _words(c.name) if w not in MEASURED) for c in found) if by_name else Counter()
-        if twice := [words for words, times in plain.items() if times > 1] or [
-            c.name for c in found if re.search(r" \(\d+\)$", c.name)
-        ]:
-            what = twice[0] if isinstance(twice[0], str) else " ".join(twice[0])
-            self._ask("columns", f"expected each position once, got several of {what!r}")
+        twice = [" ".join(words) for words, times in plain.items() if times > 1]
+        twice += [c.name for c in found if re.search(r" \(\d+\)$", c.name)]
+        if twice:
+            self._ask("columns", f"expected each position once, got several of {twice[0]!r}")
         return found
 
     def _wide_form(self, arrays: Table) -> Table:
@@ -454,7 +454,8 @@ class _Reading:
             if len(chosen) % parts:
                 continue
             first = len(chosen) // parts
-            slopes = np.gradient(values[:, :first], times if dt is None else dt, axis=0)
+            spacing: Any = times if dt is None else dt
+            slopes = np.gradient(values[:, :first], spacing, axis=0)
             second = values[:, first : 2 * first]
             if np.linalg.norm(second) > 0 and np.linalg.norm(slopes - second) < 0.3 * np.linalg.norm(second):
                 a, b = _listed(chosen[first : 2 * first]), _listed(chosen[:first])
