@@ -54,9 +54,9 @@ class Demonstration:
         dt = positive(self.dt, "dt")
         if not isinstance(self.name, str):
             raise ValueError(f"name: expected a string, got {type(self.name).__name__}")
-        columns = tuple(map(str, self.columns))
-        if columns and len(columns) != positions.shape[1]:
-            raise ValueError(f"columns: expected {positions.shape[1]} names, got {len(columns)}")
+        columns = tuple(self.columns) if isinstance(self.columns, (list, tuple)) else (None,)
+        if columns and (len(columns) != positions.shape[1] or not all(isinstance(c, str) for c in columns)):
+            raise ValueError(f"columns: expected {positions.shape[1]} names, got {self.columns!r}")
         object.__setattr__(self, "columns", columns)
         object.__setattr__(self, "positions", torch.from_numpy(positions))
         object.__setattr__(self, "dt", dt)
@@ -200,7 +200,9 @@ class Demonstration:
     def _of(cls, motion: recordings.Motion, name: str) -> Demonstration:
         logger.info(motion.origin)
         if motion.dt is not None:
-            return cls(torch.from_numpy(motion.positions), motion.dt, name, columns=motion.columns, origin=motion.origin)
+            return cls(
+                torch.from_numpy(motion.positions), motion.dt, name, columns=motion.columns, origin=motion.origin
+            )
         even = cls.from_times(motion.times, motion.positions, name)
         return replace(even, columns=motion.columns, origin=motion.origin)
 

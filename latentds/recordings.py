@@ -72,6 +72,8 @@ KINDS = {
 }
 """Kinds, the first that fits; the last four are positions."""
 POSITIONS = ("joint", "orientation", "Cartesian", "position")
+NAMES = {"name", "names", "joints", "columns", "labels"}
+"""Words of a list that names the columns of an array beside it."""
 MEASURED = {"actual", "measured", "filtered", "raw", "smoothed", "meas", "msr"}
 """Words that tell apart two recordings of the same quantity."""
 
@@ -154,6 +156,7 @@ class _Reading:
         arrays = self._wide_form(arrays)
         self.texts = {name: a for name, a in arrays.items() if a.dtype.kind == "U"}
         numbers = {name: a for name, a in arrays.items() if a.dtype.kind in "fiuMm"}
+        self.seen = {name: a for name, a in numbers.items() if a.ndim}
         self.scalars = {name: a for name, a in numbers.items() if a.ndim == 0}
         self.arrays = {name: a for name, a in numbers.items() if 1 <= a.ndim <= 2 and a.size}
         lengths = {len(a) for name, a in self.arrays.items() if a.ndim == 1 and _is_time(name, a)}
@@ -227,7 +230,7 @@ class _Reading:
     def _labels(self, count: int) -> list[str]:
         """Names of an array's columns, if the file gives them beside it."""
         for other, text in self.texts.items():
-            if {"name", "names", "joints", "columns", "labels"} & set(_words(other)):
+            if NAMES & set(_words(other)):
                 rows = text if text.ndim == 2 else text[None]
                 if rows.shape[-1] == count and len(set(rows[0])) == count:
                     if (rows != rows[0]).any():
@@ -252,8 +255,8 @@ class _Reading:
     def _positions(self, columns: list[_Column]) -> list[_Column]:
         """The columns that are positions by their names, or those whose names say nothing at all."""
         for name, text in self.texts.items():
-            if text.ndim == 1 and len(text) > 2 and kind_of(name) in POSITIONS and len(set(text)) > 1:
-                raise ValueError(f"path: {self.label} is not a table of numbers ({text[0]!r} in column {name!r})")
+            if text.ndim == 1 and len(text) > 2 and kind_of(name) in POSITIONS and not NAMES & set(_words(name)):
+                raise ValueError(f"path: {self.label} is not a table of numbers ({str(text[0])!r} in column {name!r})")
         found = [c for c in columns if c.kind in POSITIONS]
         by_name = bool(found)
         found = found or [c for c in columns if c.kind == "unknown"]
@@ -297,8 +300,10 @@ class _Reading:
     def _time(
         self, chosen: list[_Column], clock: list[_Column], free: bool, unit: str | None, dt: float | None, count: int
     ) -> tuple[NDArray[np.float64] | None, float | None, _Said]:
-        rising = [c for c in chosen if c.kind == "unknown" and _is_even(c.values)] if free and len(chosen) > 1 else []
-        unnamed = [c for c in rising if self.arrays[c.block].ndim == 2]
+        others = [c for c in self.columns if c not in chosen and len(c.values) == count]
+        pool = others if not free else chosen if len(chosen) > 1 else []
+        rising = [c for c in pool if c.kind == "unknown" and _is_even(c.values)]
+        unnamed = [c for c in rising if free and self.arrays[c.block].ndim == 2]
         if dt is not None:
             return None, dt, _Said(f"dt {dt:g} s as asked", self._not_time(unnamed))
         if clock:
@@ -320,7 +325,9 @@ class _Reading:
         if len(rising) == 1:
             return self._in_seconds(_as_stamps(rising[0]), unit, " (it rises evenly)")
         if rising:
-            self._ask("time", f"expected one column that rises evenly, got {_listed(rising)}; if none is time, pass dt=")
+            self._ask(
+                "time", f"expected one column that rises evenly, got {_listed(rising)}; if none is time, pass dt="
+            )
         self._ask("dt", "expected the seconds between two rows, which nothing here tells (or time=, a column)")
 
     def _not_time(self, rising: list[_Column]) -> tuple[str, ...]:
@@ -331,7 +338,8 @@ class _Reading:
             self.remarks.append(f"column {rising[0].name} counts rows")
             return (rising[0].name,)
         self._ask(
-            "columns", f"expected to know whether column {rising[0].name}, which rises evenly as time does, is a position"
+            "columns",
+            f"expected to know whether column {rising[0].name}, which rises evenly as time does, is a position",
         )
 
     def _named_stamps(self, count: int, taken: set[str]) -> list[_Stamps]:
@@ -351,12 +359,12 @@ class _Reading:
         named = [s for s in named if not _counts(s.values)] or named
         durations = [(s.values[-1] - s.values[0]) * UNITS[self._unit(s, unit)] for s in named] if named[1:] else [1.0]
         if max(durations) > 1.01 * min(durations):
-            self._ask("time", f"expected one column of time, got {', '.join(repr(s.name) for s in named)}, which differ")
+            self._ask(
+                "time", f"expected one column of time, got {', '.join(repr(s.name) for s in named)}, which differ"
+            )
         return next((s for s in named if {"stamp", "stamps"} & set(_words(s.name))), named[0])
 
-    def _in_seconds(
-        self, stamps: _Stamps, unit: str | None, how: str
-    ) -> tuple[NDArray[np.float64], None, _Said]:
+    def _in_seconds(self, stamps: _Stamps, unit: str | None, how: str) -> tuple[NDArray[np.float64], None, _Said]:
         name = stamps.name
         if not np.isfinite(stamps.values).all():
             row = int(np.argmin(np.isfinite(stamps.values)))
@@ -382,7 +390,9 @@ class _Reading:
             return stamps.unit or "s"
         rows = f"steps of {step:.4g}, {duration:.4g} in all, in column {stamps.name!r}"
         if stamps.unit:
-            self._ask("unit", f"expected a motion of {DURATION[0]:g} to {DURATION[1]:g} s, got {rows}, in {stamps.unit}")
+            self._ask(
+                "unit", f"expected a motion of {DURATION[0]:g} to {DURATION[1]:g} s, got {rows}, in {stamps.unit}"
+            )
         if len(possible) > 1:
             dated = [u for u in possible if _within(float(stamps.values[0]) * UNITS[u], EPOCH)]
             possible = dated if len(dated) == 1 else possible
@@ -425,7 +435,10 @@ class _Reading:
             if times is not None and _is_step(name) and scalar.dtype.kind in "fiu":
                 mean = times[-1] / (len(times) - 1)
                 if not _within(float(scalar) / mean, (0.95, 1.05)):
-                    self._ask("time", f"expected one answer, got {mean:.4g} s a row by the time, {float(scalar):g} by {name!r}")
+                    self._ask(
+                        "time",
+                        f"expected one answer, got {mean:.4g} s a row by the time, {float(scalar):g} by {name!r}",
+                    )
 
     # Questions -----------------------------------------------------------------------------------------------------
 
@@ -462,10 +475,10 @@ class _Reading:
                 self._ask("columns", f"expected positions, got {a}, the velocities of {b}")
 
     def _ask(self, argument: str, text: str) -> NoReturn:
-        raise ValueError(f"{argument}: {text}; pass {argument}= ({self.label} holds {self._shapes(self.arrays)})")
+        raise ValueError(f"{argument}: {text}; pass {argument}= ({self.label} holds {self._shapes(self.seen)})")
 
     def _shapes(self, names: Mapping[str, Any]) -> str:
-        return _shortened([f"{n or 'an array'} {'×'.join(map(str, self.arrays[n].shape))}" for n in names]) or "nothing"
+        return _shortened([f"{n or 'an array'} {'×'.join(map(str, self.seen[n].shape))}" for n in names]) or "nothing"
 
 
 @dataclass(frozen=True)
@@ -616,7 +629,9 @@ def _read_text(data: bytes) -> Table:
         raise ValueError("no rows")
     delimiter = hint[0][-1] if hint else _delimiter(body[-1][1])
     rows = [(i, _cells(line, delimiter)) for i, line in body]
-    start = next((k for k, (_, row) in enumerate(rows) if 2 * sum(map(_is_value, row)) >= max(1, sum(map(bool, row)))), None)
+    start = next(
+        (k for k, (_, row) in enumerate(rows) if 2 * sum(map(_is_value, row)) >= max(1, sum(map(bool, row)))), None
+    )
     if start is None:
         raise ValueError("no row of numbers")
     lead, rows = rows[:start], rows[start:]
@@ -742,7 +757,10 @@ def _column(cells: list[str]) -> NDArray[Any]:
     """Cells of text as (N,) numbers, times or text, or (N, k) numbers or text if they are lists."""
     if all(DATE.fullmatch(cell) for cell in cells) and cells:
         found = [DATE.fullmatch(cell.replace(",", ".")) for cell in cells]
-        return np.array([f"{m[1] or '1970-01-01'}T{m[2]:0>8}" if m else "NaT" for m in found], dtype="datetime64[ns]")
+        return np.array(
+            [f"{m[1] or '1970-01-01'}T{'0' * (m[2][1] == ':')}{m[2]}" if m else "NaT" for m in found],
+            dtype="datetime64[ns]",
+        )
     if all(cell[:1] in ("[", "(") or cell.startswith("array(") for cell in cells):
         inside = [re.sub(r"^[^\[(]*[\[(]+('[a-z]', *\[)?|[\])]+$", "", cell) for cell in cells]
         lists = [[item.strip("'\" ") for item in re.split(r"[,;\s]+", text.strip()) if item] for text in inside]
