@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
 import math
 import os
@@ -23,7 +24,7 @@ from . import files
 from .arguments import positive
 
 Table = dict[str, NDArray[Any]]
-"""A recording as it stands: scalars, (N,) and (N, k) arrays, numbers and text, by name. An array without a name has ""."""
+"""A recording as it stands: scalars, (N,) and (N, k) arrays, numbers and text, by name; "" if it has none."""
 
 UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Seconds in each unit of time."""
@@ -36,6 +37,11 @@ MAX_DIM = 200
 EPOCH = (9e8, 4e9)
 """Seconds since 1970 of the years 1998 to 2096."""
 
+
+def _vocabulary(words: str) -> frozenset[str]:
+    return frozenset(words.split())
+
+
 # What a name says of its column. A name is split into words at whatever is no letter, and before capitals.
 UNIT_WORDS = {
     word: unit
@@ -47,28 +53,28 @@ UNIT_WORDS = {
     }.items()
     for word in words.split()
 }
-TIME = set("time times timestamp timestamps stamp stamps elapsed clock zeit rosbagtimestamp datetime date".split())
+TIME = _vocabulary("time times timestamp timestamps stamp stamps elapsed clock zeit rosbagtimestamp datetime date")
 STEPS = {("dt",), ("delta", "t"), ("delta", "time"), ("time", "step"), ("timestep",), ("sample", "time"), ("period",)}
 STEPS |= {("sampling", "time"), ("sampling", "period"), ("sample", "period"), ("time", "delta")}
-RATES = set("fs fps hz rate frequency freq".split())
+RATES = _vocabulary("fs fps hz rate frequency freq")
 KINDS = {
-    "other": set(
+    "other": _vocabulary(
         "error err errors std var variance cov covariance temperature temperatures temp voltage status mode id seq "
-        "index idx frame frames row rows sample samples count counter".split()
+        "index idx frame frames row rows sample samples count counter"
     ),
-    "acceleration": set(
-        "acceleration accelerations acc accel accelerations qdd ddq qddot qacc ddx ddy ddz xdd ax ay az ddot".split()
+    "acceleration": _vocabulary(
+        "acceleration accelerations acc accel qdd ddq qddot qacc ddx ddy ddz xdd ax ay az ddot"
     ),
-    "velocity": set(
+    "velocity": _vocabulary(
         "velocity velocities vel vels speed speeds qd dq qdot qvel dx dy dz xdot ydot zdot vx vy vz wx wy wz dot v "
-        "omega twist dtheta thetadot".split()
+        "omega twist dtheta thetadot"
     ),
-    "effort": set("effort efforts torque torques tau force forces fx fy fz mx my mz current currents wrench".split()),
-    "command": set("desired target targets command commands commanded cmd ref reference setpoint".split()),
-    "joint": set("q joint joints angle angles theta qpos j encoder".split()),
-    "orientation": set("qx qy qz qw w quat quaternion orientation rotation rpy roll pitch yaw rx ry rz euler".split()),
-    "Cartesian": set("x y z px py pz xyz pose tcp ee cartesian".split()),
-    "position": {"position", "positions", "pos"},
+    "effort": _vocabulary("effort efforts torque torques tau force forces fx fy fz mx my mz current currents wrench"),
+    "command": _vocabulary("desired target targets command commands commanded cmd ref reference setpoint"),
+    "joint": _vocabulary("q joint joints angle angles theta qpos j encoder"),
+    "orientation": _vocabulary("qx qy qz qw w quat quaternion orientation rotation rpy roll pitch yaw rx ry rz euler"),
+    "Cartesian": _vocabulary("x y z px py pz xyz pose tcp ee cartesian"),
+    "position": _vocabulary("position positions pos"),
 }
 """Kinds, the first that fits; the last four are positions."""
 POSITIONS = ("joint", "orientation", "Cartesian", "position")
@@ -372,8 +378,8 @@ class _Reading:
         if not (np.diff(stamps.values) > 0).all():
             row = int(np.argmin(np.diff(stamps.values) > 0))
             raise ValueError(
-                f"times: expected strictly increasing, got {stamps.values[row]:.15g} then {stamps.values[row + 1]:.15g} "
-                f"at row {row} of {name!r} in {self.label}; pass time= or dt="
+                f"times: expected strictly increasing, got {stamps.values[row]:.15g} then "
+                f"{stamps.values[row + 1]:.15g} at row {row} of {name!r} in {self.label}; pass time= or dt="
             )
         found = self._unit(stamps, unit)
         times = (stamps.values - stamps.values[0]) * UNITS[found]
@@ -426,7 +432,7 @@ class _Reading:
         return None
 
     def _plausible_dt(self, dt: float, name: str, count: int) -> float:
-        if _within(dt, STEP) and _within(dt * (count - 1), DURATION) or self.ours:
+        if (_within(dt, STEP) and _within(dt * (count - 1), DURATION)) or self.ours:
             return dt
         self._ask("dt", f"expected {STEP[0]:g} to {STEP[1]:g} s between rows, got {dt:g} from {name!r}: {count} rows")
 
@@ -546,7 +552,12 @@ def _within(value: float, interval: tuple[float, float]) -> bool:
 
 
 def _listed(columns: Sequence[_Column]) -> str:
-    return _shortened([c.name for c in columns])
+    """Names, those of the numbered columns of an array in one."""
+    names: list[str] = []
+    for block, run in itertools.groupby(columns, lambda c: c.block if not c.label else c):
+        them = [c.name for c in run]
+        names += [f"{block}[…] ({len(them)})"] if block and isinstance(block, str) and them[1:] else them
+    return _shortened(names)
 
 
 def _shortened(names: Sequence[str], most: int = 8) -> str:
@@ -701,7 +712,7 @@ def _cells(line: str, delimiter: str) -> list[str]:
 def _header(
     lead: list[tuple[int, list[str]]], comments: list[tuple[int, str]], first: int, width: int, delimiter: str
 ) -> list[str]:
-    """Names of the columns from the lines above the numbers, or from the last comment there; empty if there are none."""
+    """Names of the columns: from the lines above the numbers, or from the last comment there; empty if none."""
     trimmed = [(i, row[:-1] if len(row) == width + 1 and not row[-1] else row) for i, row in lead]
     fitting = [row for _, row in trimmed if len(row) == width]
     if trimmed and (len(fitting) > 2 or (len(trimmed[-1][1]) not in (1, width))):

@@ -123,7 +123,10 @@ READ = {
              np.stack([Q, V, TAU], axis=2).reshape(N, 9)),
     ),
     "joints by name": ("a.csv", text("time,shoulder,elbow,wrist,shoulder_vel,elbow_vel,wrist_vel", T1, Q1, V)),
-    "robot and command": ("a.csv", text("t,actual_q_0,actual_q_1,actual_q_2,target_q_0,target_q_1,target_q_2", T1, Q, Q)),
+    "robot and command": (
+        "a.csv",
+        text("t," + ",".join(f"{k}_q_{i}" for k in ("actual", "target") for i in range(3)), T1, Q, Q),
+    ),
     "rostopic echo -p": (
         "a.csv",
         text("%time,field.header.seq,field.header.stamp,field.header.frame_id,"
@@ -253,7 +256,8 @@ REFUSED = {
     "joints and hand": ("a.csv", text("t,q1,q2,q3,x,y,z", T1, Q, Q + 1), "columns: .*pass columns="),
     "two arms": ("a.npz", archive(left=Q, right=Q, t=T), "columns: .*left 60×3, right 60×3"),
     "several motions": ("a.npz", archive(q_0=Q, q_1=Q[5:], dt=DT), "columns: .*q_0 60×3, q_1 55×3"),
-    "raw and filtered": ("a.csv", text("t,raw_x,raw_y,filtered_x,filtered_y", T1, Q[:, :2], Q[:, :2]), "columns: .*'x'"),
+    "raw and filtered": ("a.csv", text("t,raw_x,raw_y,filtered_x,filtered_y", T1, Q[:, :2], Q[:, :2]),
+                         "columns: .*'x'"),
     "names twice": ("a.csv", text("t,x,y,x,y", T1, Q[:, :2], Q[:, :2]), "columns: .*several"),
     "velocities without names": ("a.csv", text("", T1, Q, V), "columns: .*velocities of 1, 2, 3"),
     "and efforts": ("a.npy", lambda p: np.save(p, np.column_stack([T, Q, V, TAU])), "columns: .*velocities of 1, 2, 3"),
@@ -263,9 +267,10 @@ REFUSED = {
     "three axes": ("a.npz", archive(q=np.stack([Q, Q]), dt=DT), "columns: .*q 2×60×3"),
     "header too short": ("a.csv", text("t,x", *[[f"{v:.3f}".replace(".", ",") for v in c] for c in (T, Q[:, 0])]),
                          "path: .*names 2 columns, the numbers have 4"),
-    "commas for everything": ("a.csv", text("", *[[f"{v:.3f}".replace(".", ",") for v in c] for c in (T, T * 0 + 0.01)]),
+    "commas for everything": ("a.csv", text("", *[[f"{v:.3f}".replace(".", ",") for v in c] for c in (T, T / T[-1])]),
                               "path: .*decimal commas"),
-    "points and commas": ("a.csv", text("t;x;y", T1, [f"{v:.3f}".replace(".", ",") for v in T], T1, sep=";"), "path: .*point"),
+    "points and commas": ("a.csv", text("t;x;y", T1, [f"{v:.3f}".replace(".", ",") for v in T], T1, sep=";"),
+                          "path: .*point"),
     "columns numbered": ("a.csv", text("0,1,2,3", T1, Q), "path: .*numbers the columns"),
     "a word": ("a.csv", lambda p: p.write_text("t,x\n0,1\n0.1,oops\n0.2,3\n"), "path: .*line 3: 'oops'.*'x'"),
     "ragged": ("a.csv", lambda p: p.write_text("t,x\n0,1\n0.1\n0.2,3\n"), "path: .*line 3 has 1 cells"),
@@ -394,7 +399,7 @@ def test_frames_of_pandas():
         assert (shown.name, shown.origin[:5]) == ("mine", "mine:"), kind
     with pytest.raises(ValueError, match="table: expected a pandas frame or a mapping to arrays, got ndarray"):
         Demonstration.from_table(Q)
-    with pytest.raises(ValueError, match="dt: .*the table holds x 60"):
+    with pytest.raises(ValueError, match=r"dt: .*the table holds x 60"):
         Demonstration.from_table({"x": Q[:, 0]})
 
 
