@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import cast
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -36,7 +37,6 @@ class AffineCouplings(Diffeomorphism):
 
     center: Tensor
     scale: Tensor
-    _order: Tensor
 
     def __init__(
         self,
@@ -58,7 +58,6 @@ class AffineCouplings(Diffeomorphism):
         )
         self.register_buffer("center", torch.zeros(dim, dtype=torch.float64))
         self.register_buffer("scale", torch.ones(dim, dtype=torch.float64))
-        self.register_buffer("_order", torch.cat(parts).argsort(), persistent=False)
 
     def extra_repr(self) -> str:
         return f"dim={self.dim}, n_layers={self.n_layers}, n_features={self.n_features}"
@@ -144,7 +143,13 @@ class AffineCouplings(Diffeomorphism):
         return [(j % 2, cast("_Coupling", layer)) for j, layer in enumerate(self.layers)]
 
     def _join(self, parts: list[Tensor]) -> Tensor:
-        return torch.cat(parts, -1)[..., self._order]
+        even, odd = parts[0], nn.functional.pad(parts[1], (0, self.dim % 2))
+        return torch.stack([even, odd], -1).flatten(-2)[..., : self.dim]
+
+
+def no_autocast(like: Tensor) -> AbstractContextManager[Any]:
+    """Within it torch.autocast takes no product in half precision, of which a map would become another one."""
+    return nullcontext() if like.is_meta else torch.autocast(like.device.type, enabled=False)
 
 
 class _Coupling(nn.Module):
@@ -165,25 +170,27 @@ class _Coupling(nn.Module):
 
     def forward(self, p: Tensor) -> tuple[Tensor, Tensor]:
         """s(p), t(p): (..., a) -> (..., b) each."""
-        cosines = torch.cos(self._angles(p))
-        half = cosines.shape[-1] // 2
-        return cosines[..., :half] @ self.amplitudes[0].mT, cosines[..., half:] @ self.amplitudes[1].mT
+        with no_autocast(p):
+            cosines = torch.cos(self._angles(p))
+            half = cosines.shape[-1] // 2
+            return cosines[..., :half] @ self.amplitudes[0].mT, cosines[..., half:] @ self.amplitudes[1].mT
 
     def with_slopes(self, p: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """s, t and ds/dp, dt/dp: (..., a) -> (..., b), (..., b), (..., b, a), (..., b, a)."""
-        angles = self._angles(p)
-        cosines, sines = torch.cos(angles), torch.sin(angles)
-        half = angles.shape[-1] // 2
-        # ds_i/dp_k = -Σ_f A_if W_fk sin_f: one product of the sines with the (b a, F) matrix of the A_if W_fk
-        slopes = -self.amplitudes.unsqueeze(-2) * self.frequencies.mT.unsqueeze(-3)
-        shape = (*p.shape[:-1], *slopes.shape[1:3])
-        rows = slopes.flatten(1, 2)
-        return (
-            cosines[..., :half] @ self.amplitudes[0].mT,
-            cosines[..., half:] @ self.amplitudes[1].mT,
-            (sines[..., :half] @ rows[0].mT).reshape(shape),
-            (sines[..., half:] @ rows[1].mT).reshape(shape),
-        )
+        with no_autocast(p):
+            angles = self._angles(p)
+            cosines, sines = torch.cos(angles), torch.sin(angles)
+            half = angles.shape[-1] // 2
+            # ds_i/dp_k = -Σ_f A_if W_fk sin_f: one product of the sines with the (b a, F) matrix of the A_if W_fk
+            slopes = -self.amplitudes.unsqueeze(-2) * self.frequencies.mT.unsqueeze(-3)
+            shape = (*p.shape[:-1], *slopes.shape[1:3])
+            rows = slopes.flatten(1, 2)
+            return (
+                cosines[..., :half] @ self.amplitudes[0].mT,
+                cosines[..., half:] @ self.amplitudes[1].mT,
+                (sines[..., :half] @ rows[0].mT).reshape(shape),
+                (sines[..., half:] @ rows[1].mT).reshape(shape),
+            )
 
     def _angles(self, p: Tensor) -> Tensor:
         """W p + b of the log-scale, then of the shift: (..., a) -> (..., 2 F)."""

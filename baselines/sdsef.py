@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from latentds.arguments import whole_number
+from latentds.arguments import refuse_tracing, whole_number
 from latentds.base import FitReport, LatentDS
-from latentds.demonstration import Demonstration, demonstrations_of
+from latentds.demonstration import Demonstration, demonstrations_of, goal_apart
 from latentds.dynamics import Frame, LatentDynamics
 
-from .couplings import AffineCouplings
+from .couplings import AffineCouplings, no_autocast
 from .training import Plan, Training, descend
 
 PLANS = {
@@ -157,7 +157,8 @@ class NormalizedDescent(LatentDynamics):
 
     def speed(self, y: Tensor) -> Tensor:
         """exp(g(y)), latent units per second: (..., n) -> (...)."""
-        log_speed: Tensor = self.network(self.psi.normalize(y)).squeeze(-1)
+        with no_autocast(y):
+            log_speed: Tensor = self.network(self.psi.normalize(y)).squeeze(-1)
         return log_speed.clamp(*self.log_speed_range).exp() / self.duration
 
     def flow(self, x: Tensor, t: Tensor, frame: Frame) -> Tensor:
@@ -167,6 +168,7 @@ class NormalizedDescent(LatentDynamics):
         log r below the guard and logarithmic far outside. dt/dw is known at the nodes, the times there follow by a
         rule of fourth order, and w at the given times by cubic Hermite interpolation.
         """
+        refuse_tracing("this rollout")
         guard = GUARD * frame.length
         offset = x - frame.attractor
         floor = torch.finfo(x.dtype).tiny ** 0.25
@@ -235,8 +237,8 @@ class _Normalized(NamedTuple):
     @classmethod
     def of(cls, shown: Sequence[Demonstration]) -> _Normalized:
         goal = torch.stack([d.goal for d in shown]).mean(0)
-        if any(bool((d.start == goal).all()) for d in shown):
-            raise ValueError("demonstration: expected a goal apart from the start, got a closed loop")
+        for d in shown:
+            goal_apart(d, goal)
         every = torch.cat([d.positions for d in shown])
         low, high = every.amin(0), every.amax(0)
         center, extent = (low + high) / 2, high - low
@@ -398,7 +400,10 @@ def _generator(seed: int | None) -> torch.Generator | None:
 
 def _linear(n_in: int, n_out: int, generator: torch.Generator | None) -> nn.Linear:
     """torch's own initial weights, but from a generator and without touching the global one."""
-    layer: nn.Linear = nn.utils.skip_init(nn.Linear, n_in, n_out, dtype=torch.float64)  # type: ignore[no-untyped-call]
+    device = torch.get_default_device()  # which skip_init does not ask
+    layer: nn.Linear = nn.utils.skip_init(  # type: ignore[no-untyped-call]
+        nn.Linear, n_in, n_out, dtype=torch.float64, device=device
+    )
     bound = n_in**-0.5
     for part in (layer.weight, layer.bias):
         nn.init.uniform_(part, -bound, bound, generator=generator)

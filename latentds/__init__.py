@@ -11,6 +11,7 @@ from .kernels import warmup
 from .methods.chebyshev import ChebyshevDS
 from .methods.tube import TubeDS
 from .storage import load
+from .transform import as_transform
 
 __version__ = "0.1.0"  # the one place
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "LocallyWeightedTranslations",
     "StableDS",
     "TubeDS",
+    "as_transform",
     "certify",
     "compare",
     "datasets",

@@ -74,6 +74,21 @@ def check_points(dim: int, points: Tensor, name: str) -> None:
         raise ValueError(f"{name}: expected shape (..., {dim}), got {tuple(points.shape)}")
 
 
+def check_precision(dtype: torch.dtype) -> None:
+    """Refuse to move a map or a system to a dtype in which it would be another one."""
+    if dtype not in (torch.float32, torch.float64):
+        raise ValueError(
+            f"dtype: expected torch.float64 or torch.float32, got {dtype}, whose rounding, layer after layer, "
+            "makes another system; inputs of any real dtype are answered in it"
+        )
+
+
+def refuse_tracing(what: str) -> None:
+    """Refuse to be recorded by torch.jit.trace, which keeps the steps that one example took and says nothing."""
+    if torch._C._get_tracing_state() is not None:
+        raise RuntimeError(f"{what} takes as many steps as its start needs and cannot be traced; trace the velocity")
+
+
 def positive(value: Any, name: str) -> float:
     try:
         number = float(value)

@@ -19,17 +19,18 @@ from typing import Any, ClassVar, TypeVar
 import torch
 from torch import Tensor, nn
 
-from .arguments import check_points, real_tensor, whole_number
+from .arguments import check_points, check_precision, positive, real_tensor, whole_number
 from .demonstration import Demonstration, demonstrations_of
 from .deploy.controller import Controller
 from .deploy.tables import FieldTables, field_tables
-from .diffeomorphism import Diffeomorphism
+from .diffeomorphism import Diffeomorphism, eager_for_derivatives
 from .dynamics import Frame, LatentDynamics
 from .fidelity import Excerpt, Fidelity, FitWarning, measure
 from .files import write_tensors
 from .integrate import integrate
 from .kernels.dispatch import no_active_transforms
 from .memory import Memo, tensors_of
+from .wrappers import Similarity, check_rotation
 
 FORMAT = 2
 """Of the files of systems; raised when they change so that another latentds would misread them."""
@@ -81,8 +82,8 @@ class StableDS(nn.Module, ABC):
         dim: n >= 1.
 
     Attributes:
-        attractor: y*, (n,), where all motions end. What a method's ``fit`` writes into the buffer, the motion follows;
-            it is not to be replaced.
+        attractor: y*, (n,) buffer, where all motions end. It is for ``fit`` to write, in place, and cannot be replaced:
+            :meth:`with_goal` gives the system that ends elsewhere.
     """
 
     report_type: ClassVar[type[FitReport]] = FitReport
@@ -93,7 +94,7 @@ class StableDS(nn.Module, ABC):
     def __init__(self, dim: int) -> None:
         super().__init__()
         self.dim = whole_number(dim, "dim", at_least=1)
-        self.fit_report = None
+        self._fit_report = None
         self.register_buffer("attractor", torch.zeros(self.dim, dtype=torch.float64))
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -142,9 +143,55 @@ class StableDS(nn.Module, ABC):
         points, wanted = self._points(y0, "y0")
         return self._begun_at(y0, integrate(self.forward, points, self._times(t), self.attractor).to(wanted))
 
-    def controller(self) -> Controller:
+    def controller(self, *, max_speed: float = math.inf) -> Controller:
         """The velocity field as it is now for a real-time loop, NumPy in and out: see :class:`Controller`."""
-        return Controller(self)
+        return Controller(self, max_speed=max_speed)
+
+    def with_goal(self, goal: Any) -> MovedDS:
+        """The same motion to another goal, shifted as a whole.
+
+        Args:
+            goal: (n,) finite. A gradient of what the new system computes reaches it.
+        """
+        return self._moved(_vector(goal, self.attractor, "goal"))
+
+    def transformed(self, *, rotation: Any = None, translation: Any = None, scale: float = 1.0) -> MovedDS:
+        """The same motion under y ↦ s R y + t, about the origin.
+
+        Args:
+            rotation: R, (n, n) orthogonal (a reflection is one, too); None leaves directions as they are.
+            translation: t, (n,) finite; None is 0. A gradient of what the new system computes reaches it.
+            scale: s > 0.
+        """
+        turn = torch.eye(self.dim) if rotation is None else check_rotation(rotation, self.dim)
+        turn = turn.to(self.attractor)
+        factor = positive(scale, "scale")
+        goal = factor * (turn * self.attractor).sum(-1)
+        if translation is not None:
+            goal = goal + _vector(translation, self.attractor, "translation")
+        return self._moved(goal, rotation=turn, scale=factor)
+
+    def slowed(self, factor: float) -> MovedDS:
+        """The same motion in ``factor`` > 0 times its duration; below 1 it is faster."""
+        return self._moved(self.attractor, speed=1 / positive(factor, "factor"))
+
+    def _moved(self, attractor: Tensor, **change: Any) -> MovedDS:
+        moved = MovedDS(self)
+        moved.register_buffer("attractor", attractor.clone())
+        for name, value in change.items():
+            moved.similarity.get_buffer(name).copy_(torch.as_tensor(value))
+        return moved
+
+    def excerpts(self) -> tuple[Excerpt, ...]:
+        """What the report of its fit keeps of the demonstrations, as this system is to follow them; () if nothing."""
+        report = self.fit_report
+        fidelity = report.fidelity if isinstance(report, FitReport) else None
+        return () if fidelity is None else fidelity.shown
+
+    def surroundings(self, ball: Tensor) -> Tensor | None:
+        """Where the motion was shown: points (m, n) for those of a unit ball, of which 0 is the attractor and the start
+        lies at distance 1. None if the system does not know."""
+        return None
 
     def tables(self) -> FieldTables | None:
         """The velocity field as plain arrays, for controllers and exporters; None where it cannot be written so."""
@@ -165,20 +212,14 @@ class StableDS(nn.Module, ABC):
         Atomic: the file is there whole or not at all.
 
         Raises:
-            ValueError: if a setting is no number, string, boolean or None, if the report is not of ``report_type``,
-                or if something other than a regular file is at ``path``.
+            ValueError: if a setting is no number, string, boolean, None or system, if the report is not of
+                ``report_type``, or if something other than a regular file is at ``path``.
         """
-        if lost := [name for name in inspect.signature(type(self)).parameters if not hasattr(self, name)]:
-            raise ValueError(f"ds: expected constructor arguments kept as attributes, got none for {', '.join(lost)}")
-        settings, report = self.settings, self.fit_report
-        for name, value in settings.items():
-            if not isinstance(value, (int, float, str, type(None))):
-                raise ValueError(f"ds: expected settings of numbers, strings or None, got {name}={value!r:.80}")
+        told, report = {"format": FORMAT} | _class_and_settings(self), self.fit_report
         if report is not None and type(report) is not self.report_type:
             raise ValueError(
                 f"ds: expected a fit_report of report_type {self.report_type.__name__}, got {type(report).__name__}"
             )
-        told = {"format": FORMAT, "class": type(self).__name__, "settings": settings}
         try:
             about = json.dumps(told | {"report": None if report is None else asdict(report)})
         except TypeError as error:
@@ -199,12 +240,7 @@ class StableDS(nn.Module, ABC):
             del self.__dict__["_assigning"]
 
     def _apply(self: Self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
-        dtype = fn(torch.zeros_like(self.attractor)).dtype
-        if dtype not in (torch.float32, torch.float64):
-            raise ValueError(
-                f"dtype: expected torch.float64 or torch.float32, got {dtype}, whose rounding, layer after layer, "
-                "makes another system; inputs of any real dtype are answered in it"
-            )
+        check_precision(fn(torch.zeros_like(self.attractor)).dtype)
         moved: Self = super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         return moved
 
@@ -224,6 +260,11 @@ class StableDS(nn.Module, ABC):
 
     def _times(self, t: Any) -> Tensor:
         """``t`` as seconds since its first entry, in the module's dtype."""
+        if torch.compiler.is_exporting():
+            raise ValueError(
+                "rollout: cannot be exported, as times must be seen to be checked; export the velocity, ds(y), and "
+                "integrate it, or decode and the flow of the dynamics"
+            )
         times = real_tensor(t, "t").to(self.attractor.device)
         if times.ndim != 1 or len(times) == 0:
             raise ValueError(f"t: expected shape (T,) with T >= 1, got {tuple(times.shape)}")
@@ -239,6 +280,26 @@ class StableDS(nn.Module, ABC):
         """``path`` (..., T, n) with ``y0`` itself, not what rounding made of it, as its first point."""
         start = torch.as_tensor(y0).to(path.dtype)
         return torch.cat([start.unsqueeze(-2), path[..., 1:, :]], dim=-2)
+
+
+def _class_and_settings(ds: StableDS) -> dict[str, Any]:
+    """What :func:`latentds.load` makes a system of, before its tensors."""
+    if lost := [name for name in inspect.signature(type(ds)).parameters if not hasattr(ds, name)]:
+        raise ValueError(f"ds: expected constructor arguments kept as attributes, got none for {', '.join(lost)}")
+    settings = {}
+    for name, value in ds.settings.items():
+        if not isinstance(value, (int, float, str, StableDS, type(None))):
+            raise ValueError(f"ds: expected settings of numbers, strings or None, got {name}={value!r:.80}")
+        settings[name] = _class_and_settings(value) if isinstance(value, StableDS) else value
+    return {"class": type(ds).__name__, "settings": settings}
+
+
+def _vector(values: Any, like: Tensor, name: str) -> Tensor:
+    """``values`` as a finite vector of the shape, dtype and device of another."""
+    vector = real_tensor(values, name).to(like)
+    if vector.shape != like.shape or (no_active_transforms() and not bool(torch.isfinite(vector).all())):
+        raise ValueError(f"{name}: expected {tuple(like.shape)} finite numbers, got {values!r:.80}")
+    return vector
 
 
 _UNDERWAY: ContextVar[tuple[int, ...]] = ContextVar("ids of the systems that are being fitted", default=())
@@ -347,6 +408,10 @@ class LatentDS(StableDS):
 
         return rows[:-2].reshape(y.shape), push, Frame.between(rows[-2], rows[-1])
 
+    def surroundings(self, ball: Tensor) -> Tensor:
+        frame = self.frame()
+        return self.decode(frame.attractor + frame.length * ball)
+
     def encode(self, y: Tensor) -> Tensor:
         """ψ⁻¹: demonstration -> latent, (..., n) -> (..., n)."""
         points, wanted = self._points(y)
@@ -393,6 +458,7 @@ class LatentDS(StableDS):
         exact = copy.deepcopy(self).to("cpu", torch.float64)
         return field_tables(exact.diffeomorphism, exact.dynamics, exact.frame())
 
+    @eager_for_derivatives
     def forward(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
         x, push, frame = self._linearize(points)
@@ -408,3 +474,91 @@ class LatentDS(StableDS):
         times = self._times(t)
         x, _, frame = self._linearize(points)
         return self._begun_at(y0, self.diffeomorphism(self.dynamics.flow(x, times, frame)).to(wanted))
+
+
+class MovedDS(StableDS):
+    """Another system, moved, turned, scaled or slowed; what :meth:`StableDS.with_goal` and its like return.
+
+    ẏ = σ s R f(z) with z = z* + Rᵀ(y - y*)/s, where z* is the attractor of the system inside. A system that is one of a
+    stable system in other coordinates is as stable: V(y) is V(z). The system inside is a submodule, so that training
+    this one trains it; ``fit`` teaches it what becomes the demonstration. ``fit_report`` is that of the system inside,
+    in its units.
+
+    Args:
+        ds: the system inside; where it is until moved.
+
+    Attributes:
+        attractor: y*, (n,) buffer. Moved in place, it takes the whole motion with it.
+        similarity: R, s and σ.
+    """
+
+    def __init__(self, ds: StableDS) -> None:
+        super().__init__(ds.dim)
+        self.ds = ds
+        self.similarity = Similarity(ds.dim)
+        self.to(ds.attractor)
+        with torch.no_grad():
+            self.attractor.copy_(ds.attractor)
+
+    @property
+    def fit_report(self) -> FitReport | None:
+        return self.ds.fit_report
+
+    @fit_report.setter
+    def fit_report(self, report: FitReport | None) -> None:
+        self.ds.fit_report = report
+
+    @property
+    def report_type(self) -> type[FitReport]:  # type: ignore[override]
+        return self.ds.report_type
+
+    def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> MovedDS:
+        before, after = self.ds.attractor.clone(), self.attractor
+        theirs = demonstrations_of(demonstration, self.dim)
+        shown = [self.similarity.fetch_motion(one, before, after) for one in theirs]
+        self.ds.fit(shown[0] if isinstance(demonstration, Demonstration) else shown, progress=progress)
+        with torch.no_grad():
+            after.copy_(self.similarity.carry(self.ds.attractor, before, after))
+        if isinstance(report := self.fit_report, FitReport) and report.learned_from:
+            self.fit_report = replace(report, learned_from=tuple(one.fingerprint for one in theirs))
+        return self
+
+    fit.measured = True  # type: ignore[attr-defined]  # the fit inside measures itself
+
+    def excerpts(self) -> tuple[Excerpt, ...]:
+        return tuple(
+            self.similarity.carry_excerpt(one, self.ds.attractor, self.attractor) for one in self.ds.excerpts()
+        )
+
+    def forward(self, y: Tensor) -> Tensor:
+        points, wanted = self._points(y)
+        return self.similarity.velocity(self.ds(self._inside(points))).to(wanted)
+
+    def lyapunov(self, y: Tensor) -> Tensor:
+        points, wanted = self._points(y)
+        return self.ds.lyapunov(self._inside(points)).to(wanted)
+
+    def rollout(self, y0: Tensor, t: Tensor) -> Tensor:
+        points, wanted = self._points(y0, "y0")
+        path = self.ds.rollout(self._inside(points), self.similarity.speed * self._times(t))
+        return self._begun_at(y0, self._outside(path).to(wanted))
+
+    def tables(self) -> FieldTables | None:
+        inside = self.ds.tables()
+        return None if inside is None else self.similarity.tables(inside, self.ds.attractor, self.attractor)
+
+    def surroundings(self, ball: Tensor) -> Tensor | None:
+        inside = self.ds.surroundings(ball)
+        return None if inside is None else self._outside(inside)
+
+    def latent_error(self, y0: Tensor, t: Tensor) -> Tensor | None:
+        return self.ds.latent_error(self._inside(y0), self.similarity.speed * self._times(t))
+
+    def _inside(self, y: Tensor) -> Tensor:
+        return self.similarity.fetch(y, self.ds.attractor, self.attractor)
+
+    def _outside(self, z: Tensor) -> Tensor:
+        return self.similarity.carry(z, self.ds.attractor, self.attractor)
+
+    def _fingerprint(self) -> str:
+        return self.ds._fingerprint()

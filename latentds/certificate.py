@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .arguments import real_array, whole_number
-from .base import FitReport, LatentDS, StableDS
+from .base import LatentDS, MovedDS, StableDS
 from .fidelity import ROUNDING, STARTS, Excerpt, measure
 
 Verdict = Literal["proven", "not falsified", "falsified"]
@@ -101,8 +101,8 @@ def certify(ds: StableDS, region: Any = None, *, n_samples: int = 1000, seed: in
     Args:
         ds: any system, fitted or not; it is left as it is.
         region: (2, n) lowest and highest corner of a box, in the units of the demonstration. By default one around the
-            image of the latent ball that the demonstration spans; needed for a system that is no
-            :class:`~latentds.LatentDS`.
+            image of the latent ball that the demonstration spans; needed for a system without
+            :meth:`~latentds.StableDS.surroundings`.
         n_samples: points to sample, >= 10. The costlier searches try fewer.
         seed: of the samples, >= 0.
 
@@ -147,9 +147,13 @@ class _Search:
         self.times = torch.linspace(0, self.duration, N_TIMES, dtype=torch.float64).to(self.points.device)
 
     def lines(self) -> list[Line]:
-        found = [self._finite()]
+        found, inside = [self._finite()], self.ds
+        while isinstance(inside, MovedDS):
+            inside = inside.ds
+        if isinstance(inside, LatentDS):
+            found += self._invertibility(inside)
         if isinstance(self.ds, LatentDS):
-            found += [*self._invertibility(self.ds), self._rate(self.ds)]
+            found += [self._rate(self.ds)]
         found += [self._attractor()]
         if found[0].verdict == "falsified":
             return found
@@ -375,9 +379,7 @@ def _settled(
 
 def _shown(ds: StableDS) -> tuple[Excerpt, ...]:
     """What the report of its fit keeps of the demonstrations."""
-    report = ds.fit_report
-    fidelity = report.fidelity if isinstance(report, FitReport) else None
-    shown = () if fidelity is None else fidelity.shown
+    shown = ds.excerpts()
     if any(len(one.path[0]) != ds.dim for one in shown):
         raise ValueError(f"ds: expected a fit_report that keeps demonstrations of dimension {ds.dim}, got another")
     return shown
@@ -389,19 +391,18 @@ def _region(ds: StableDS, region: Any, generator: torch.Generator) -> Tensor:
         if corners.shape != (2, ds.dim) or not np.isfinite(corners).all() or not (corners[0] < corners[1]).all():
             raise ValueError(f"region: expected (2, {ds.dim}) finite corners, low below high, got {corners.tolist()}")
         return torch.from_numpy(corners)
-    if not isinstance(ds, LatentDS):
-        raise ValueError(f"region: expected (2, {ds.dim}) corners, as {type(ds).__name__} implies none, got None")
     draws = torch.randn(256, ds.dim, generator=generator, dtype=torch.float64)
     directions = torch.nn.functional.normalize(draws, dim=-1)
     radii = torch.linspace(0.1, 1, 256, dtype=torch.float64).unsqueeze(-1)
     with torch.no_grad():
-        frame = ds.frame()
-        ball = frame.attractor + frame.length * (radii * directions).to(ds.attractor)
-        points = torch.cat([ds.decode(ball), ds.attractor.unsqueeze(0)]).cpu().double()
+        around = ds.surroundings((radii * directions).to(ds.attractor))
+    if around is None:
+        raise ValueError(f"region: expected (2, {ds.dim}) corners, as {type(ds).__name__} implies none, got None")
+    points = torch.cat([around, ds.attractor.unsqueeze(0)]).detach().cpu().double()
     points = points[torch.isfinite(points).all(-1)]
     if not bool((points != points[:1]).any()):
         raise ValueError(
-            f"region: expected (2, {ds.dim}) corners, as a latent length of {float(frame.length)} implies none"
+            f"region: expected (2, {ds.dim}) corners, as the latent ball of {type(ds).__name__} implies none, got None"
         )
     low, high = points.amin(0), points.amax(0)
     margin = (0.25 * (high - low)).clamp(min=0.01 * float((high - low).max()))

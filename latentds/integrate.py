@@ -20,6 +20,8 @@ import torch
 from scipy.integrate import RK45
 from torch import Tensor
 
+from .arguments import refuse_tracing
+
 _STAGES = [*(RK45.A[stage, :stage].tolist() for stage in range(1, 6)), RK45.B.tolist()]  # the last is the step's end
 _ERROR = RK45.E.tolist()
 _BETWEEN = torch.from_numpy(RK45.P.T[::-1].copy())  # the slopes' weights, by falling powers of the share of the step
@@ -48,6 +50,7 @@ def integrate(
         (..., T, n). A row that cannot go on is NaN from there on, and a RuntimeWarning says so: its velocity is not
         finite or jumps, or ``max_steps`` were not enough, as in a stiff field. A start that is not finite is just NaN.
     """
+    refuse_tracing("this rollout")
     clock = times.to(torch.float64).contiguous()
     rounding = torch.finfo(y0.dtype).eps
     floor = 16 * rounding * attractor.detach().abs().amax() + torch.finfo(y0.dtype).tiny

@@ -502,6 +502,10 @@ def kind_of(name: str) -> str:
         return "time"
     if _is_step(name):
         return "step"
+    if words == ["v"]:
+        return "unknown"  # beside u, say
+    if words[:2] == ["q", "d"]:
+        return "command"  # q_d, the desired posture; qd is a velocity
     return next((kind for kind, known in KINDS.items() if known & set(words)), "unknown")
 
 

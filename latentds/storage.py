@@ -14,7 +14,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import torch
 
-from .base import FORMAT, StableDS
+from .base import FORMAT, MovedDS, StableDS
 from .files import read_tensors
 from .methods.chebyshev import ChebyshevDS
 from .methods.tube import TubeDS
@@ -26,8 +26,8 @@ SLACK = 1000
 def load(path: str | os.PathLike[str], *, classes: Sequence[type[StableDS]] = ()) -> StableDS:
     """Read a system that :meth:`StableDS.save` wrote, from a source that need not be trusted.
 
-    Nothing that the file names is imported or run: its class is looked up by name among ChebyshevDS, TubeDS and
-    ``classes``. Whether what was loaded is stable is for :func:`latentds.certify` to say.
+    Nothing that the file names is imported or run: its class is looked up by name among ChebyshevDS, TubeDS, MovedDS
+    and ``classes``. Whether what was loaded is stable is for :func:`latentds.certify` to say.
 
     Args:
         path: of the file.
@@ -38,7 +38,7 @@ def load(path: str | os.PathLike[str], *, classes: Sequence[type[StableDS]] = ()
         FileNotFoundError: if there is no such file.
     """
     text, state = read_tensors(path)
-    known: dict[str, type[StableDS]] = {"ChebyshevDS": ChebyshevDS, "TubeDS": TubeDS}
+    known: dict[str, type[StableDS]] = {"ChebyshevDS": ChebyshevDS, "MovedDS": MovedDS, "TubeDS": TubeDS}
     known |= {allowed.__name__: allowed for allowed in classes}
     try:
         return _rebuilt(text, state, known)
@@ -54,30 +54,37 @@ def _rebuilt(text: str, state: dict[str, torch.Tensor], known: dict[str, type[St
     if told["format"] != FORMAT:
         age = "a newer" if told["format"] > FORMAT else "an older"
         raise ValueError(f"expected format {FORMAT}, got {told['format']}: it needs {age} latentds")
-    if told["class"] not in known:
-        raise ValueError(
-            f"expected a class among {sorted(known)}, got {told['class']!r:.80}; allow others by classes=[…]"
-        )
-    settings = told["settings"]
-    wanted = inspect.signature(known[told["class"]]).parameters
-    if not isinstance(settings, dict) or set(settings) != set(wanted):
-        raise ValueError(f"expected the settings {sorted(wanted)}, got {settings!r:.200}")
-    held = sum(value.numel() for value in state.values())
-    sizes = [v for k, v in settings.items() if (k == "dim" or k.startswith("n_")) and isinstance(v, int)]
-    if math.prod(max(size, 1) for size in sizes) > SLACK * max(held, 1):
-        raise ValueError(f"expected sizes that {held} stored numbers can fill, got {settings!r:.200}")
     if not all(bool(torch.isfinite(value).all()) for value in state.values() if value.is_floating_point()):
         raise ValueError("expected finite numbers, got NaN or inf")
     if any(value.is_complex() for value in state.values()):
         raise ValueError("expected real numbers, got complex ones")
     with torch.random.fork_rng(devices=[]):  # an unseeded constructor draws numbers, only to have them replaced
-        ds = known[told["class"]](**settings)
+        ds = _made(told, known, sum(value.numel() for value in state.values()))
     dtype = state["attractor"].dtype
     if dtype not in (torch.float64, torch.float32):
         raise ValueError(f"expected an attractor in float64 or float32, got {dtype}")
     ds.to(dtype).load_state_dict(state)
     ds.fit_report = None if told["report"] is None else _typed(told["report"], ds.report_type, "report")
     return ds
+
+
+def _made(told: dict[str, Any], known: dict[str, type[StableDS]], held: int) -> StableDS:
+    """A system by its class and settings, those of a system in it likewise, that so many stored numbers can fill."""
+    if told["class"] not in known:
+        raise ValueError(
+            f"expected a class among {sorted(known)}, got {told['class']!r:.80}; allow others by classes=[…]"
+        )
+    settings: Any = told["settings"]
+    wanted = inspect.signature(known[told["class"]]).parameters
+    if not isinstance(settings, dict) or set(settings) != set(wanted):
+        raise ValueError(f"expected the settings {sorted(wanted)}, got {settings!r:.200}")
+    sizes = [v for k, v in settings.items() if (k == "dim" or k.startswith("n_")) and isinstance(v, int)]
+    if math.prod(max(size, 1) for size in sizes) > SLACK * max(held, 1):
+        raise ValueError(f"expected sizes that {held} stored numbers can fill, got {settings!r:.200}")
+    settings = {
+        name: _made(value, known, held) if isinstance(value, dict) else value for name, value in settings.items()
+    }
+    return known[told["class"]](**settings)
 
 
 def _typed(told: Any, wanted: Any, name: str) -> Any:

@@ -127,6 +127,8 @@ READ = {
         "a.csv",
         text("t," + ",".join(f"{k}_q_{i}" for k in ("actual", "target") for i in range(3)), T1, Q, Q),
     ),
+    "desired postures": ("a.csv", text("t,q_0,q_1,q_2,q_d_0,q_d_1,q_d_2,dq_0,dq_1,dq_2", T1, Q, Q + 1, V)),
+    "pixels": ("a.csv", text("t,u,v,c", T1, Q)),
     "rostopic echo -p": (
         "a.csv",
         text("%time,field.header.seq,field.header.stamp,field.header.frame_id,"

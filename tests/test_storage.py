@@ -122,7 +122,7 @@ def test_third_parties_by_explicit_argument(tmp_path):
     Mine(2, rate=3.0).save(tmp_path / "mine")
     assert latentds.load(tmp_path / "mine", classes=[Mine]).rate == 3.0
     with pytest.raises(
-        ValueError, match=r"expected a class among \['ChebyshevDS', 'TubeDS'\], got 'Mine'; allow others"
+        ValueError, match=r"expected a class among \['ChebyshevDS', 'MovedDS', 'TubeDS'\], got 'Mine'; allow others"
     ):
         latentds.load(tmp_path / "mine")
     FDM(2).save(tmp_path / "fdm")

@@ -21,6 +21,7 @@ def warmup(dims: Sequence[int] = (2, 3)) -> None:
         for tangents in (0, 1):
             forward_adjoint(dim, tangents)
         inverse_adjoint(dim)
-        velocity_kernel(dim)
+        for tangents in (0, dim):
+            velocity_kernel(dim, tangents)
     pack_kernel()
     greedy_kernel()

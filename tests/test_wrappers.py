@@ -1,0 +1,230 @@
+"""Systems moved, turned, scaled and slowed: the same motion elsewhere, and systems like any other."""
+
+from __future__ import annotations
+
+import copy
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+import latentds
+from baselines import FDM, SDSEF
+from latentds import Demonstration, TubeDS, certify
+from latentds.base import MovedDS
+from latentds.testing import parametrize_stable_ds, wavy_motion
+
+F64 = torch.float64
+
+
+def turn(dim, seed=0):
+    """A random rotation (or, by chance, a reflection)."""
+    return torch.linalg.qr(torch.randn(dim, dim, generator=torch.Generator().manual_seed(seed), dtype=F64))[0]
+
+
+KINDS = {
+    "TubeDS": lambda dim: TubeDS(dim, n_layers=12, refined=False),
+    "FDM": lambda dim: FDM(dim, n_layers=12),
+    "SDSEF": lambda dim: SDSEF(dim, n_layers=3, n_features=20, seed=0, epochs=10),
+}
+
+
+@parametrize_stable_ds(
+    {
+        "turned": lambda dim: KINDS["TubeDS"](dim).transformed(rotation=turn(dim), scale=2.0).slowed(1.5),
+        "slowed": lambda dim: KINDS["SDSEF"](dim).slowed(0.5),
+    },
+    dims=[2, 3, 7],
+)
+def test_contract(check):
+    check()
+
+
+@parametrize_stable_ds(
+    {"with another goal": lambda dim: KINDS["FDM"](dim).with_goal(torch.ones(dim))}, dims=[2], fitted=[True]
+)
+def test_contract_from_another_goal(check):
+    check()
+
+
+@pytest.fixture(params=KINDS)
+def fitted(request):
+    return KINDS[request.param](2).fit(wavy_motion(2))
+
+
+@torch.no_grad()
+def test_the_same_motion_to_another_goal(fitted, draw):
+    shift = torch.tensor([3.0, -7.0], dtype=F64)
+    moved = fitted.with_goal(fitted.attractor + shift)
+    y, times = torch.randn(6, 2, generator=draw, dtype=F64), torch.linspace(0, 2, 5, dtype=F64)
+    torch.testing.assert_close(moved.attractor, fitted.attractor + shift, rtol=0, atol=0)
+    torch.testing.assert_close(moved(y + shift), fitted(y))
+    torch.testing.assert_close(moved.lyapunov(y + shift), fitted.lyapunov(y))
+    torch.testing.assert_close(moved.rollout(y + shift, times), fitted.rollout(y, times) + shift)
+
+
+@torch.no_grad()
+def test_the_same_motion_turned_scaled_shifted_and_slowed(fitted, draw):
+    rotation, translation = turn(2), torch.tensor([0.5, -2.0], dtype=F64)
+    moved = fitted.transformed(rotation=rotation, translation=translation, scale=3.0).slowed(2.0)
+    y, times = torch.randn(2, 3, 2, generator=draw, dtype=F64), torch.linspace(0, 2, 5, dtype=F64)
+
+    def image(z):
+        return 3 * z @ rotation.T + translation
+
+    torch.testing.assert_close(moved.attractor, image(fitted.attractor))
+    torch.testing.assert_close(moved(image(y)), 3 * fitted(y) @ rotation.T / 2)
+    torch.testing.assert_close(moved.lyapunov(image(y)), fitted.lyapunov(y))
+    torch.testing.assert_close(moved.rollout(image(y), 2 * times), image(fitted.rollout(y, times)))
+
+
+@torch.no_grad()
+def test_moved_twice_is_moved_once(fitted, draw):
+    y, rotation = torch.randn(4, 2, generator=draw, dtype=F64), turn(2)
+    once = fitted.transformed(rotation=rotation, translation=torch.ones(2), scale=0.5)
+    twice = fitted.transformed(scale=0.5).transformed(rotation=rotation).transformed(translation=[1, 1])
+    torch.testing.assert_close(twice(y), once(y))
+    torch.testing.assert_close(fitted.with_goal([9.0, 9.0]).with_goal(fitted.attractor)(y), fitted(y))
+
+
+def test_the_system_inside_is_the_same_and_is_trained(fitted):
+    moved = fitted.with_goal([1.0, 2.0]).slowed(2.0)
+    assert moved.ds.ds is fitted
+    assert [id(p) for p in moved.parameters()] == [id(p) for p in fitted.parameters()]
+    before = {name: value.clone() for name, value in fitted.state_dict().items()}
+    moved.rollout(torch.zeros(2), torch.tensor([0.0, 0.5])).square().sum().backward()
+    torch.optim.SGD(moved.parameters(), 1e-3).step()
+    assert any(not torch.equal(before[name], value) for name, value in fitted.state_dict().items())
+    with torch.no_grad():
+        assert moved(torch.tensor([1.0, 2.0])).abs().max() < 1e-9
+    assert not moved.fit_report_is_current
+    assert moved.fit_report is fitted.fit_report
+
+
+def test_gradients_reach_the_goal(fitted):
+    goal, times = torch.tensor([1.0, 2.0], dtype=F64, requires_grad=True), torch.linspace(0, 9, 3, dtype=F64)
+    net = torch.nn.Linear(3, 2, dtype=F64)
+    fitted.with_goal(goal).rollout(torch.zeros(2, dtype=F64), times)[-1].sum().backward()
+    step, ends = 1e-5, []
+    for side in (1, -1):
+        with torch.no_grad():
+            ends.append(fitted.with_goal(goal + side * step).rollout(torch.zeros(2, dtype=F64), times)[-1].sum())
+    assert float(goal.grad.sum()) == pytest.approx(float(ends[0] - ends[1]) / (2 * step), rel=1e-5)
+    fitted.requires_grad_(False).with_goal(net(torch.ones(3, dtype=F64)))(torch.zeros(2)).sum().backward()
+    assert net.weight.grad.abs().max() > 0
+
+
+@torch.no_grad()
+def test_goals_in_a_batch():
+    fitted = KINDS["FDM"](2).fit(wavy_motion(2))
+    goals, y = torch.randn(4, 2, dtype=F64), torch.randn(2, dtype=F64)
+    found = torch.func.vmap(lambda goal: fitted.with_goal(goal)(y))(goals)
+    torch.testing.assert_close(found, torch.stack([fitted.with_goal(goal)(y) for goal in goals]))
+
+
+def test_it_learns_what_it_is_shown():
+    shown = wavy_motion(2)
+    moved = KINDS["TubeDS"](2).transformed(rotation=turn(2), translation=[3.0, 1.0], scale=0.2).slowed(4.0).fit(shown)
+    torch.testing.assert_close(moved.attractor, shown.goal)
+    with torch.no_grad():
+        path = moved.rollout(shown.start, shown.times)
+    assert (path - shown.positions).norm(dim=-1).max() < 0.1 * shown.size
+    assert moved.fit_report_is_current
+    several = Demonstration(shown.positions + 0.1 * (1 - torch.linspace(0, 1, len(shown)).unsqueeze(1)), shown.dt)
+    assert torch.allclose(moved.fit([shown, several]).attractor, shown.goal)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_saved_and_loaded_with_what_is_inside(fitted, tmp_path, dtype):
+    moved = fitted.with_goal([1.0, 2.0]).transformed(rotation=turn(2), scale=2.0).slowed(3.0).to(dtype)
+    moved.save(tmp_path / "a")
+    back = latentds.load(tmp_path / "a", classes=[FDM, SDSEF])
+    y = torch.randn(5, 2)
+    with torch.no_grad():
+        for twin in (back, pickle.loads(pickle.dumps(moved)), copy.deepcopy(moved)):
+            assert torch.equal(twin(y), moved(y))
+            assert torch.equal(twin.attractor, moved.attractor)
+    assert back.fit_report == moved.fit_report
+    assert type(back.ds.ds.ds) is type(fitted)
+    assert back.fit_report_is_current
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("rotation", 1.1 * torch.eye(2)), ("scale", torch.tensor(-1.0)), ("speed", torch.tensor(0.0))]
+)
+def test_a_state_that_makes_no_stable_system_does_not_load(name, value):
+    moved = FDM(2).slowed(2.0)
+    with pytest.raises(RuntimeError, match=f"{name}: expected"):
+        moved.load_state_dict(moved.state_dict() | {f"similarity.{name}": value})
+
+
+def test_certified_where_the_motion_is_shown(fitted):
+    here, moved = certify(fitted, n_samples=200), fitted.with_goal([50.0, 2.0]).transformed(scale=2.0)
+    there = certify(moved, n_samples=200)
+    off = [{line.claim: line.worst for line in found.falsified} for found in (here, there)]
+    assert off[0].keys() <= {"follows its demonstration"}  # of ten epochs
+    assert off[1] == pytest.approx(off[0])
+    low, high = np.array(there.region)
+    assert (low < moved.attractor.numpy()).all()
+    assert (moved.attractor.numpy() < high).all()
+    spans = [np.ptp(np.array(found.region), axis=0) for found in (here, there)]
+    np.testing.assert_allclose(spans[1], 2 * spans[0], rtol=1e-6)
+    proven = [line.claim for line in there.lines if line.verdict == "proven"]
+    assert len(proven) == 1
+    assert "layer" in proven[0] or "coupling" in proven[0]
+
+
+def test_one_without_surroundings_must_be_told_where(fitted):
+    class Bare(type(fitted)):
+        def surroundings(self, ball):
+            return None
+
+    fitted.__class__ = Bare
+    with pytest.raises(ValueError, match="region: expected"):
+        certify(fitted.with_goal([1.0, 1.0]))
+
+
+@pytest.mark.parametrize("kind", ["FDM", "TubeDS"])
+def test_the_controller_stays_compiled(kind, draw):
+    for dim in (1, 3):
+        fitted = KINDS[kind](dim).fit(wavy_motion(dim))
+        moved = fitted.with_goal(torch.ones(dim)).transformed(rotation=turn(dim), scale=0.3).slowed(2.0)
+        controller, y = moved.controller(), torch.randn(50, dim, generator=draw, dtype=F64)
+        assert controller.compiled
+        with torch.no_grad():
+            np.testing.assert_allclose(controller(y.numpy()), moved(y).numpy(), rtol=1e-9, atol=1e-12)
+    assert not SDSEF(2).slowed(2.0).controller().compiled
+
+
+def test_moved_in_place_it_takes_the_motion_along(fitted):
+    moved, y = fitted.slowed(1.0), torch.randn(5, 2, dtype=F64)
+    with torch.no_grad():
+        moved.attractor.add_(2.0)
+        torch.testing.assert_close(moved(y + 2.0), fitted(y))
+        fitted.attractor.sub_(0.5)  # the goal is the outer system's own
+        assert moved(moved.attractor).abs().max() < 1e-9
+
+
+BAD = {
+    "goal": [[1.0], [1.0, math.nan], "there", torch.zeros(2, 2)],
+    "rotation": [torch.eye(3), 2 * torch.eye(2), torch.full((2, 2), math.nan), "left", torch.zeros(2)],
+    "translation": [[1.0], [math.inf, 0.0]],
+    "scale": [0.0, -1.0, math.nan, "large", math.inf],
+    "factor": [0.0, -1.0, math.nan, None],
+}
+
+
+@pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in BAD.items() for value in values])
+def test_bad_arguments(name, value):
+    ds = FDM(2)
+    move = {"goal": ds.with_goal, "factor": ds.slowed}.get(name, lambda value: ds.transformed(**{name: value}))
+    with pytest.raises(ValueError, match=f"^{name}: expected"):
+        move(value)
+
+
+def test_a_rotation_typed_in_is_made_one():
+    moved = MovedDS(FDM(2)).transformed(rotation=[[0.8660254, -0.5], [0.5, 0.8660254]])
+    rotation = moved.similarity.rotation
+    torch.testing.assert_close(rotation.T @ rotation, torch.eye(2, dtype=F64), rtol=0, atol=1e-15)
