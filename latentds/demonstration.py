@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import io
+import logging
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from . import files
+from . import files, recordings
 from .arguments import point_array, positive, real_array
+
+logger = logging.getLogger(__name__)
 
 CLOSED = 1e-6
 """Distance of the goal from the start, in sizes of the motion, up to which it counts as a closed loop."""
@@ -32,6 +34,8 @@ class Demonstration:
             kept as a float64 CPU tensor. The last point is the goal.
         dt: seconds between two points, > 0.
         name: a label for tables and pictures.
+        columns: n names of the coordinates, or none.
+        origin: one line that says what a recording's columns were taken for; empty if it was not read from one.
 
     Raises:
         ValueError: naming the argument, what was expected and what came.
@@ -40,6 +44,8 @@ class Demonstration:
     positions: Tensor
     dt: float
     name: str = ""
+    columns: tuple[str, ...] = field(default=(), kw_only=True, repr=False)
+    origin: str = field(default="", kw_only=True, repr=False)
     velocities: Tensor = field(init=False, repr=False)
     """(N, n) units per second: second-order finite differences of the positions."""
 
@@ -48,6 +54,10 @@ class Demonstration:
         dt = positive(self.dt, "dt")
         if not isinstance(self.name, str):
             raise ValueError(f"name: expected a string, got {type(self.name).__name__}")
+        columns = tuple(self.columns) if isinstance(self.columns, (list, tuple)) else (None,)
+        if columns and (len(columns) != positions.shape[1] or not all(isinstance(c, str) for c in columns)):
+            raise ValueError(f"columns: expected {positions.shape[1]} names, got {self.columns!r}")
+        object.__setattr__(self, "columns", columns)
         object.__setattr__(self, "positions", torch.from_numpy(positions))
         object.__setattr__(self, "dt", dt)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -132,69 +142,81 @@ class Demonstration:
         return cls(torch.from_numpy(resampled), float(even[-1] - even[0]) / (len(even) - 1), name)
 
     @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Demonstration:
-        """Read a ``.npz`` (arrays ``positions`` and ``dt`` or ``times``; no pickles) or a ``.csv`` file.
+    def load(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        columns: str | int | Sequence[str | int] | None = None,
+        time: str | int | None = None,
+        unit: str | None = None,
+        dt: float | None = None,
+        name: str | None = None,
+    ) -> Demonstration:
+        """Read a recording: what :meth:`save` wrote, or a file of your own.
 
-        A CSV has one header line and one row per point; its first column is ``t`` in seconds.
+        ``.csv``, ``.tsv``, ``.txt`` and ``.dat`` (any usual delimiter, decimal points or commas, with names or
+        without), ``.npy``, ``.npz`` (no pickles), ``.mat`` and ``.json``. Time and positions are found by their names,
+        and the time by its even steps if there are none; velocities and efforts are left out. What was understood is
+        said in ``origin`` and logged. Nothing ambiguous is guessed: the error says what was seen and what to pass.
+
+        Args:
+            path: the file.
+            columns: the positions: a name (of a column, or of an array with all its columns), a column's number from
+                0, or several.
+            time: the column of time stamps. Uneven ones are resampled as :meth:`from_times` does.
+            unit: of the time stamps: "s", "ms", "us" or "ns".
+            dt: seconds between two rows; time stamps are then not looked at.
+            name: a label; the one in the file, or the file's name, by default.
 
         Raises:
-            ValueError: if the file is neither, is damaged, holds more than 1 GiB, or does not hold a demonstration.
+            ValueError: if the file is of another kind, damaged, larger than 1 GiB, ambiguous, or holds no motion.
             FileNotFoundError: if there is no such file.
         """
         path = Path(path)
-        if path.suffix == ".npz":
-            return cls._from_npz(path)
-        if path.suffix == ".csv":
-            return cls._from_csv(path)
-        raise ValueError(f"path: expected a .npz or .csv file, got {path.name!r}")
+        table = recordings.read_table(path)
+        if name is None:
+            saved = table.get("name", np.array(0))
+            name = str(saved) if saved.ndim == 0 and saved.dtype.kind == "U" else path.stem
+        motion = recordings.understand(table, path.name, columns=columns, time=time, unit=unit, dt=dt)
+        return cls._of(motion, name)
 
     @classmethod
-    def _from_npz(cls, path: Path) -> Demonstration:
-        data = files.read_file(path)
-        try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as file:
-                size = sum(entry.file_size for entry in file.zip.infolist())  # unpacked
-                if size > files.MAX_BYTES:
-                    raise ValueError(f"holds {size} bytes, more than {files.MAX_BYTES}")
-                arrays = {key: file[key] for key in file.files if key in ("positions", "dt", "times", "name")}
-        except Exception as error:
-            raise ValueError(f"path: {path.name} is not a readable .npz without pickles ({error})") from None
-        if "positions" not in arrays or not ({"dt", "times"} & set(arrays)):
-            raise ValueError(
-                f"path: expected arrays 'positions' and 'dt' (or 'times') in {path.name}, got {sorted(arrays)}"
-            )
-        name = str(arrays["name"]) if "name" in arrays else path.stem
-        if "dt" in arrays:
-            if arrays["dt"].size != 1:
-                raise ValueError(f"dt: expected one number in {path.name}, got shape {arrays['dt'].shape}")
-            return cls(arrays["positions"], arrays["dt"].reshape(()).item(), name)
-        return cls.from_times(arrays["times"], arrays["positions"], name)
+    def from_table(
+        cls,
+        table: Any,
+        *,
+        columns: str | int | Sequence[str | int] | None = None,
+        time: str | int | None = None,
+        unit: str | None = None,
+        dt: float | None = None,
+        name: str = "",
+    ) -> Demonstration:
+        """What :meth:`load` does, for a pandas frame or a mapping from names to arrays that is at hand already."""
+        known = recordings.as_table(table)
+        motion = recordings.understand(known, name or "the table", columns=columns, time=time, unit=unit, dt=dt)
+        return cls._of(motion, name)
 
     @classmethod
-    def _from_csv(cls, path: Path) -> Demonstration:
-        data = files.read_file(path)
-        try:
-            header, *rows = data.decode("utf-8").splitlines() or [""]
-            columns = header.split(",")
-            table = np.loadtxt(rows, delimiter=",", ndmin=2) if rows else np.empty((0, len(columns)))
-        except (ValueError, UnicodeDecodeError) as error:
-            raise ValueError(f"path: {path.name} is not a table of numbers under one header line ({error})") from None
-        if columns[0] != "t" or len(columns) < 2 or table.shape[1] != len(columns):
-            raise ValueError(
-                f"path: expected a first column 't' and one more per dimension in {path.name}, got {columns}"
+    def _of(cls, motion: recordings.Motion, name: str) -> Demonstration:
+        logger.info(motion.origin)
+        if motion.dt is not None:
+            return cls(
+                torch.from_numpy(motion.positions), motion.dt, name, columns=motion.columns, origin=motion.origin
             )
-        return cls.from_times(table[:, 0], table[:, 1:], path.stem)
+        even = cls.from_times(motion.times, motion.positions, name)
+        return replace(even, columns=motion.columns, origin=motion.origin)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a ``.npz`` (exact) or ``.csv`` (17 digits) file that :meth:`load` reads. Atomic."""
+        """Write a ``.npz`` (exact) or ``.csv`` (17 digits, no names) file that :meth:`load` reads. Atomic."""
         path = Path(path)
         if path.suffix not in (".npz", ".csv"):
             raise ValueError(f"path: expected a .npz or .csv file, got {path.name!r}")
         with files.atomic_write(path) as file:
             if path.suffix == ".npz":
-                np.savez(file, positions=self.positions.numpy(), dt=self.dt, name=self.name)
+                named: dict[str, Any] = {"columns": np.array(self.columns)} if self.columns else {}
+                np.savez(file, positions=self.positions.numpy(), dt=self.dt, name=self.name, **named)
             else:
-                columns = ["t", *(f"y{i}" for i in range(self.dim))]
+                columns = ["t [s]", *(f"y{i}" for i in range(self.dim))]
                 table = np.column_stack([self.times.numpy(), self.positions.numpy()])
                 np.savetxt(file, table, delimiter=",", header=",".join(columns), comments="", fmt="%.17g")
 

@@ -155,6 +155,16 @@ def test_files_give_the_motion_back(shown, tmp_path, suffix):
     assert os.listdir(tmp_path) == [path.name]
 
 
+def test_names_of_the_coordinates(shown):
+    assert shown.columns == ()
+    named = Demonstration(shown.positions, shown.dt, columns=["height", "fall"])
+    assert named.columns == ("height", "fall")
+    assert named.fingerprint[1] == shown.fingerprint[1]
+    for columns in (["height"], "hf!", 3):
+        with pytest.raises(ValueError, match="columns: expected 2 names"):
+            Demonstration(shown.positions, shown.dt, columns=columns)
+
+
 def test_npz_with_times(tmp_path):
     np.savez(tmp_path / "a.npz", positions=[[0, 0], [1, 1], [3, 3]], times=[0, 1, 3])
     assert Demonstration.load(tmp_path / "a.npz").positions[:, 0].tolist() == [0, 1.5, 3]
@@ -184,9 +194,9 @@ FILES = {
         "not a readable .npz without pickles",
     ),
     "a bare array": (".npz", lambda p: save_bare(p), "not a readable .npz|expected arrays"),
-    "no dt": (".npz", lambda p: np.savez(p, positions=np.eye(3)), "expected arrays 'positions' and 'dt'"),
-    "no positions": (".npz", lambda p: np.savez(p, dt=1.0), "expected arrays 'positions' and 'dt'"),
-    "two dts": (".npz", lambda p: np.savez(p, positions=np.eye(3), dt=[1.0, 2.0]), "dt: expected one number"),
+    "no dt": (".npz", lambda p: np.savez(p, positions=np.eye(3)), "dt: expected .* pass dt="),
+    "no positions": (".npz", lambda p: np.savez(p, dt=1.0), "columns: expected columns of positions"),
+    "two dts": (".npz", lambda p: np.savez(p, positions=np.eye(3), dt=[1.0, 2.0, 1.0, 2.0]), "dt: expected one number"),
     "text dt": (".npz", lambda p: np.savez(p, positions=np.eye(3), dt="soon"), "dt: expected"),
     "bad times": (
         ".npz",
@@ -198,8 +208,8 @@ FILES = {
     "header alone": (".csv", lambda p: save_text(p, "t,y0\n"), "path: |positions: "),
     "words": (".csv", lambda p: save_text(p, "t,y0\n0,a\n1,b\n2,c\n"), "not a table of numbers"),
     "ragged": (".csv", lambda p: save_text(p, "t,y0\n0,1\n1,2,3\n2,3\n"), "not a table of numbers"),
-    "no t": (".csv", lambda p: save_text(p, "x,y\n0,1\n1,2\n2,3\n"), "expected a first column 't'"),
-    "t alone": (".csv", lambda p: save_text(p, "t\n0\n1\n2\n"), "expected a first column 't'"),
+    "no t": (".csv", lambda p: save_text(p, "x,y\n0,1\n1,2\n2,3\n"), "dt: expected .* pass dt="),
+    "t alone": (".csv", lambda p: save_text(p, "t\n0\n1\n2\n"), "columns: expected columns of positions"),
     "binary": (".csv", lambda p: p.write_bytes(b"\xff\xfe\x00" * 50), "not a table of numbers"),
     "csv back in time": (
         ".csv",
@@ -207,7 +217,7 @@ FILES = {
         "times: expected strictly increasing",
     ),
     "csv nan": (".csv", lambda p: save_text(p, "t,y0\n0,1\n1,nan\n2,3\n"), "positions: expected finite numbers"),
-    "other": (".txt", lambda p: save_text(p, "t,y0\n"), "path: expected a .npz or .csv file"),
+    "other": (".pkl", lambda p: p.write_bytes(pickle.dumps([1, 2])), "path: expected a file of kind .* got 'file.pkl'"),
 }
 
 
