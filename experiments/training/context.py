@@ -8,7 +8,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from experiments.training.loop import Learned, Loop, plain
+from experiments.training.loop import Learned, Loop, plain, solid
 from latentds import TubeDS, datasets, plotting
 
 CAMERAS = ((1.0, 0.0, 0.3), (0.0, 1.0, 0.0))
@@ -17,12 +17,12 @@ NOISE = 0.01
 """Standard deviation of each coordinate of a picture, at a focal length of 1."""
 SPREAD = 0.2
 """Cups stand within ± this, in each coordinate, of the point that the demonstration passes when …"""
-WHEN = 0.6
+WHEN = 0.3
 """… this share of its time is over. At that time the motion shall be at the cup; nobody says which goal does it."""
 
 
 def learn(quick: bool, seed: int, folder: Path) -> Learned:
-    shown = datasets.unstable_spiral(1)
+    shown = datasets.stable_spiral(1)
     ds = TubeDS(shown.dim, n_layers=40 if quick else 150, refined=not quick).fit(shown).requires_grad_(False)
     middle = shown.positions[round(WHEN * (len(shown) - 1))]
     network = small_network(2 * len(CAMERAS), shown.dim, seed)
@@ -45,7 +45,7 @@ def learn(quick: bool, seed: int, folder: Path) -> Learned:
     cups = places(200, draw)
     with torch.no_grad():
         found = paths(pictures(cups, draw), torch.linspace(0, shown.duration, 101))
-        passed = found[:, round(100 * WHEN)] - middle
+        passed = found[:, round(WHEN * (found.shape[1] - 1))] - middle
         ignored = ds.rollout(shown.start, met)[-1] - middle
     numbers = {
         "first loss": history[0],
@@ -109,9 +109,7 @@ def draw_cups(paths: Tensor, passed: Tensor, cups: Tensor, middle: Tensor) -> Fi
         space.plot(*cup, "o", color=color, mec=plotting.SHOWN, ms=8, label="" if i else "cup")
         space.plot(*path[-1], "*", color=color, mec=plotting.SHOWN, ms=11, label="" if i else "goal by the network")
     space.plot(*paths[0, 0], "s", color=plotting.SHOWN, ms=4, label="start")
-    space.set(xlabel="x", ylabel="y", zlabel="z")
-    space.set_aspect("equal")
-    space.view_init(elev=18, azim=-20)
+    solid(space, -50)
     for name, marker, color, theirs, ours in zip("xyz", "o^s", colors, cups.T, passed.T, strict=False):
         scatter.plot(theirs, ours, marker, color=color, ms=3.5, alpha=0.7, label=name)
     scatter.plot([-SPREAD, SPREAD], [-SPREAD, SPREAD], color=plotting.SHOWN, lw=0.8)

@@ -7,11 +7,12 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
 
@@ -116,3 +117,12 @@ def plain(axes: Axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(color="#DDDDDD", lw=0.6)
     axes.set_axisbelow(True)
+
+
+def solid(axes: Any, azimuth: float) -> None:
+    """Dress axes in 3-D: equal scales, few numbers."""
+    axes.set(xlabel="x", ylabel="y", zlabel="z")
+    axes.set_aspect("equal")
+    axes.view_init(elev=25, azim=azimuth)
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.set_major_locator(MaxNLocator(3))

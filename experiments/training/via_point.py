@@ -10,7 +10,7 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from experiments.training.loop import Learned, Loop, plain
+from experiments.training.loop import Learned, Loop, plain, solid
 from latentds import Demonstration, StableDS, TubeDS, certify, datasets, plotting
 
 BALL = 0.1
@@ -97,9 +97,7 @@ def draw_paths(shown: Demonstration, before: Tensor, after: Tensor) -> Figure:
     space.plot(*shown.positions.T, "--", color=plotting.SHOWN, lw=1, label="demonstration")
     space.plot(*VIA, "D", color="#009E73", mec=plotting.SHOWN, ms=7, label="via-point", zorder=9)
     space.plot(*shown.goal, "*", color="#E69F00", mec=plotting.SHOWN, ms=12, label="goal")
-    space.set(xlabel="x", ylabel="y", zlabel="z")
-    space.set_aspect("equal")
-    space.view_init(elev=18, azim=-75)
+    solid(space, -115)
     seconds = np.linspace(0, shown.duration, before.shape[1])
     via = torch.tensor(VIA).to(before)
     for row, (title, distance) in enumerate(
