@@ -84,8 +84,10 @@ def draw_densities(gaussian: Distribution, density: Distribution, points: Tensor
     with torch.no_grad():
         shades = [one.log_prob(where).exp() for one in (gaussian, density)]
     for axes, shade, title in zip(panels, shades, ("fitted Gaussian", "learned density"), strict=True):
-        image = axes.pcolormesh(*where.unbind(-1), shade, cmap="cividis", vmin=0, vmax=float(shades[1].max()))
-        axes.plot(*points[:400].T, ".", color="white", ms=1.5, alpha=0.7)
+        image = axes.pcolormesh(
+            *where.numpy().transpose(2, 0, 1), shade.numpy(), cmap="cividis", vmin=0, vmax=float(shades[1].max())
+        )
+        axes.plot(*points[:400].T.numpy(), ".", color="white", ms=1.5, alpha=0.7)
         axes.set(title=title, xlabel="x [m]", xlim=(-0.9, 0.9), ylim=(-0.9, 0.9))
         axes.set_aspect("equal")
         plain(axes)

@@ -11,6 +11,7 @@ from experiments.training import context, density, loop
 from experiments.training.__main__ import Script, run
 
 
+@pytest.mark.slow
 def test_motions_pass_the_point_and_keep_out_of_the_sphere(tmp_path):
     learned = run(Script.VIA_POINT, True, 0, tmp_path)
     told = learned.numbers
@@ -42,6 +43,7 @@ def test_the_true_density_is_one():
     assert float(total) == pytest.approx(1, abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_network_finds_goals_through_frozen_rollouts(tmp_path):
     told = run(Script.CONTEXT, True, 0, tmp_path).numbers
     assert (
@@ -101,10 +103,10 @@ def test_a_run_that_was_stopped_ends_where_it_would_have_ended(task, tmp_path, s
 def test_foreign_and_damaged_checkpoints_are_refused(task, tmp_path):
     module, loss = task()
     loop.Loop("task", 2, 1e-2, 0, tmp_path / "kept").run(module, loss)
-    with pytest.raises(ValueError, match="checkpoint: expected .*'seed': 1"):
+    with pytest.raises(ValueError, match=r"checkpoint: expected .*'seed': 1"):
         loop.Loop("task", 2, 1e-2, 1, tmp_path / "kept").run(module, loss)
     (tmp_path / "kept").write_bytes(b"nothing")
-    with pytest.raises(ValueError, match="checkpoint: .* none of this loop's"):
+    with pytest.raises(ValueError, match=r"checkpoint: .* none of this loop's"):
         loop.Loop("task", 2, 1e-2, 0, tmp_path / "kept").run(module, loss)
 
 
