@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from latentds.arguments import refuse_tracing, whole_number
 from latentds.base import FitReport, LatentDS
-from latentds.demonstration import Demonstration, demonstrations_of
+from latentds.demonstration import Demonstration, demonstrations_of, goal_apart
 from latentds.dynamics import Frame, LatentDynamics
 
 from .couplings import AffineCouplings, no_autocast
@@ -237,8 +237,8 @@ class _Normalized(NamedTuple):
     @classmethod
     def of(cls, shown: Sequence[Demonstration]) -> _Normalized:
         goal = torch.stack([d.goal for d in shown]).mean(0)
-        if any(bool((d.start == goal).all()) for d in shown):
-            raise ValueError("demonstration: expected a goal apart from the start, got a closed loop")
+        for d in shown:
+            goal_apart(d, goal)
         every = torch.cat([d.positions for d in shown])
         low, high = every.amin(0), every.amax(0)
         center, extent = (low + high) / 2, high - low

@@ -10,6 +10,7 @@ import faulthandler
 import math
 import sys
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -24,12 +25,18 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from baselines import FDM
-from latentds import ChebyshevDS, Demonstration, StableDS, TubeDS, certify
+from baselines import FDM, SDSEF
+from experiments import report
+from latentds import ChebyshevDS, Demonstration, FitWarning, StableDS, TubeDS, certify
+from latentds.certificate import Line
+from latentds.fidelity import MISS
 
+SLOW = "SDS-EF"
+"""Learns by gradient, so it gets a third of the others' cases."""
 METHODS: dict[str, Callable[[int], StableDS]] = {
     "ChebyshevDS": lambda dim: ChebyshevDS(dim, n_layers=40),
     "FDM": lambda dim: FDM(dim, n_layers=40),
+    SLOW: lambda dim: SDSEF(dim, n_layers=3, n_features=30, seed=0, epochs=100),
     "TubeDS": lambda dim: TubeDS(dim, n_layers=40, refined=False),
 }
 SHAPES = (
@@ -194,7 +201,7 @@ def cases(largest: int = 5000) -> st.SearchStrategy[Case]:
     counts = st.one_of(st.integers(3, 12), st.integers(13, 300), st.integers(301, max(301, largest)))
     return st.builds(
         Case,
-        st.sampled_from(sorted(METHODS)),
+        st.sampled_from([name for name in sorted(METHODS) for _ in range(1 if name == SLOW else 3)]),
         st.sampled_from(SHAPES),
         st.sampled_from(FLAWS),
         st.sampled_from(FORMS),
@@ -207,53 +214,75 @@ def cases(largest: int = 5000) -> st.SearchStrategy[Case]:
     )
 
 
-FOLLOWS, SAYS = "follows", "says that it does not follow"
-ROUNDING = ("decode inverts encode", "encode inverts decode", "V falls along motions", "a motion is its two halves",
-            "ψ neither folds nor flattens space", "V is above 0, and falls to 0 at the attractor")  # fmt: skip
-"""Claims that only floats break, in fits that say so."""
+FOLLOWS, SAYS, REFUSED, BROKEN = "follows", "says that it does not follow", "refused", "BROKEN"
+EXCUSED = (
+    "decode inverts encode",
+    "encode inverts decode",
+    "the closed-form Jacobian is autograd's",
+    "ψ neither folds nor flattens space",
+    "V is above 0, and falls to 0 at the attractor",
+    "V falls along motions",
+    "a motion is its two halves",
+    "every motion arrives within 100 durations",
+    "follows its demonstration",
+)
+"""Claims that may be false of a fit that says that it does not follow: what only floats break, and its timing."""
+FLAT = 1e-12
+"""A cosine of ∇V and f that is no larger is none that such a fit's rounding tells from 0."""
 
 
 def outcome(case: Case) -> str:
-    """What became of a case: ``FOLLOWS``, ``SAYS``, "ValueError: …", or, if the promise is broken, "BROKEN …"."""
+    """What became of a case: ``FOLLOWS``, ``SAYS``, "refused: …", or, if a promise is broken, "BROKEN …"."""
     try:
         shown = Demonstration(case.positions(), case.dt)
-        ds = METHODS[case.method](case.dim).fit(shown)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            ds = METHODS[case.method](case.dim).fit(shown)
     except ValueError as error:
         text = str(error)
         named = text.startswith(("positions: ", "demonstration: ", "dt: "))
-        return f"ValueError: {text}" if named else f"BROKEN a ValueError that names no argument: {text}"
+        return f"{REFUSED}: {text}" if named else f"{BROKEN} a ValueError that names no argument: {text}"
     except Exception as error:
-        return f"BROKEN {type(error).__name__}: {error}"
+        return f"{BROKEN} {type(error).__name__}: {error}"
+    says = any(issubclass(warning.category, FitWarning) for warning in told)
     try:
         with torch.no_grad():
-            path = ds.rollout(shown.start, torch.linspace(0, shown.duration, 50, dtype=torch.float64))
-        if not bool(torch.isfinite(path).all() and torch.isfinite(ds(path)).all()):
-            return "BROKEN NaN or inf in a rollout from the demonstrated start"
+            path = ds.rollout(shown.start, torch.linspace(0, shown.duration, 1000, dtype=torch.float64))
+            finite = bool(torch.isfinite(path).all() and torch.isfinite(ds(path)).all())
         certificate = certify(ds, n_samples=40)
     except Exception as error:
-        return f"BROKEN after the fit, {type(error).__name__}: {error}"
-    assert ds.fit_report is not None
-    silent = ds.fit_report.fidelity is None or ds.fit_report.fidelity.follows
-    broken = [
-        line for line in certificate.falsified if silent or line.claim not in (*ROUNDING, "follows its demonstration")
-    ]
+        return f"{BROKEN} after the fit, {type(error).__name__}: {error}"
+    if not finite:
+        return f"{BROKEN} NaN or inf in a rollout from the demonstrated start"
+    missed = float(torch.cdist(shown.positions, path).amin(1).mean()) / shown.size
+    if not says and missed > 1.2 * MISS:  # no alignment in time, exact DTW's neither, can bring them nearer
+        return f"{BROKEN} a silent misfit off by {missed:.2g} of the size"
+    broken = [line for line in certificate.falsified if not (says and _excused(line))]
     if broken:
-        return "BROKEN certificate: " + "; ".join(str(line) for line in broken)
-    return FOLLOWS if silent else SAYS
+        return f"{BROKEN} certificate: " + "; ".join(str(line) for line in broken)
+    return SAYS if says else FOLLOWS
+
+
+def _excused(line: Line) -> bool:
+    return line.claim in EXCUSED or (line.claim.startswith("V decreases") and line.worst <= FLAT)
 
 
 def summary(results: list[tuple[Case, str, float]]) -> str:
-    """Outcomes by kind, the commonest first."""
-    kinds = Counter(_kind(found) for _, found, _ in results)
+    """Outcomes of each method, then what was refused or broken, by kind, the commonest first."""
+    ends = (FOLLOWS, SAYS, REFUSED, BROKEN)
+    counts = Counter((case.method, end) for case, found, _ in results for end in ends if found.startswith(end))
+    methods = sorted({case.method for case, *_ in results})
+    lines = [[method, *(str(counts[method, end]) for end in ends)] for method in methods]
+    kinds = Counter(_kind(found) for _, found, _ in results if found.startswith((REFUSED, BROKEN)))
     slowest = max(seconds for *_, seconds in results)
-    lines = [f"{count:6d}  {kind}" for kind, count in kinds.most_common()]
-    return "\n".join([f"{len(results)} cases, slowest {slowest:.1f} s", *lines])
+    head, table = f"{len(results)} cases, slowest {slowest:.1f} s", report.table(["", *ends], lines)
+    return "\n".join([head, "", table, "", *(f"{count:6d}  {kind}" for kind, count in kinds.most_common())])
 
 
 def _kind(found: str) -> str:
-    if found.startswith("BROKEN certificate"):
-        return found.split(" (")[0]
-    return found.split(", got")[0].split(" that comes back to")[0][:110]
+    if found.startswith(f"{BROKEN} certificate"):
+        return " ".join(found.split(" (")[0].split())
+    return found.split(", got")[0].split(" that comes back to")[0].split(" off by")[0][:110]
 
 
 def main(
@@ -280,9 +309,9 @@ def main(
             found = outcome(case)
             faulthandler.cancel_dump_traceback_later()
             results.append((case, found, time.perf_counter() - began))
-            if found.startswith("BROKEN"):
+            if found.startswith(BROKEN):
                 bar.console.print(f"{case}\n{found}\n", markup=False, highlight=False)
-            broken = sum(text.startswith("BROKEN") for _, text, _ in results)
+            broken = sum(text.startswith(BROKEN) for _, text, _ in results)
             bar.update(task, advance=1, description=f"hostile demonstrations, {broken} broken promises")
 
         attempt()
@@ -292,7 +321,7 @@ def main(
         table.writerow([*Case._fields, "outcome", "seconds"])
         table.writerows([*case, found, f"{seconds:.3f}"] for case, found, seconds in results)
     print(summary(results))
-    sys.exit(any(found.startswith("BROKEN") for _, found, _ in results))
+    sys.exit(any(found.startswith(BROKEN) for _, found, _ in results))
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ from scipy.integrate import solve_ivp
 from torch import Tensor, nn
 
 from baselines import SDSEF
-from experiments import figures, goals, loops, report
+from experiments import deployed, figures, goals, loops, report
 from experiments.goals import Goal
 from latentds import ChebyshevDS, TubeDS, datasets, kernels
 from latentds.fitting.matching import match
@@ -316,7 +316,7 @@ def exponents(curves: pd.DataFrame) -> pd.DataFrame:
 
 
 def main(
-    quick: Annotated[bool, typer.Option(help="Fewer rounds and no million points: under a minute.")] = False,
+    quick: Annotated[bool, typer.Option(help="Fewer rounds, no million points, one export: some two minutes.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for tables, curves and the picture.")] = Path("results/speed"),
 ) -> None:
     """Measure every public call against a torch loop and a measured floor, on one core."""
@@ -333,6 +333,7 @@ def main(
         *gradients(rounds),
         *fits(rounds),
         *sdsef_step(rounds),
+        *deployed.measure(quick),
     ]
     curves = growth(quick)
     summary = "\n\n".join(

@@ -102,6 +102,7 @@ def summarize(rows: pd.DataFrame, names: list[str], labels: list[str]) -> str:
     parts.append(NOTES)
     if known := [name for name in names if name in TABLE_ONE[RIVALS[0]]]:
         parts += ["## Fit: mean squared error per coordinate beside the paper's Table I", _table_one(rows, known)]
+    parts += ["## Fits that follow their demonstration, by their own measurement", _follows(rows, names, labels)]
     parts += ["## Rollouts that failed, diverged or did not converge", _failures(rows)]
     return "# Ten spirals\n\n" + "\n\n".join(parts) + "\n"
 
@@ -157,6 +158,20 @@ def _table_one(rows: pd.DataFrame, names: list[str]) -> str:
             line += [f"{reached:.2e}", f"{paper:.2e}", f"{reached / paper:.2f}"]
         lines.append(line)
     return report.table(["spiral", *(f"{r}{what}" for r in RIVALS for what in ("", ", paper", ", ratio"))], lines)
+
+
+def _follows(rows: pd.DataFrame, names: list[str], labels: list[str]) -> str:
+    lines = []
+    for name in names:
+        fits = [rows[(rows["demonstration"] == name) & (rows["method"] == label)] for label in labels]
+        lines.append([name, *(_how_many(found.groupby("seed")["follows"].all().tolist()) for found in fits)])
+    return report.table(["spiral", *labels], lines)
+
+
+def _how_many(follows: list[bool]) -> str:
+    if len(set(follows)) > 1:
+        return f"{sum(follows)} of {len(follows)} seeds"
+    return {True: "yes", False: "**no**"}[follows[0]] if follows else "—"
 
 
 def _failures(rows: pd.DataFrame) -> str:

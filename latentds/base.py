@@ -23,7 +23,7 @@ from .arguments import check_points, check_precision, positive, real_tensor, who
 from .demonstration import Demonstration, demonstrations_of
 from .deploy.controller import Controller
 from .deploy.tables import FieldTables, field_tables
-from .diffeomorphism import Diffeomorphism
+from .diffeomorphism import Diffeomorphism, eager_for_derivatives
 from .dynamics import Frame, LatentDynamics
 from .fidelity import Excerpt, Fidelity, FitWarning, measure
 from .files import write_tensors
@@ -260,6 +260,11 @@ class StableDS(nn.Module, ABC):
 
     def _times(self, t: Any) -> Tensor:
         """``t`` as seconds since its first entry, in the module's dtype."""
+        if torch.compiler.is_exporting():
+            raise ValueError(
+                "rollout: cannot be exported, as times must be seen to be checked; export the velocity, ds(y), and "
+                "integrate it, or decode and the flow of the dynamics"
+            )
         times = real_tensor(t, "t").to(self.attractor.device)
         if times.ndim != 1 or len(times) == 0:
             raise ValueError(f"t: expected shape (T,) with T >= 1, got {tuple(times.shape)}")
@@ -453,6 +458,7 @@ class LatentDS(StableDS):
         exact = copy.deepcopy(self).to("cpu", torch.float64)
         return field_tables(exact.diffeomorphism, exact.dynamics, exact.frame())
 
+    @eager_for_derivatives
     def forward(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
         x, push, frame = self._linearize(points)

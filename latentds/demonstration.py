@@ -218,9 +218,9 @@ def jitter(positions: NDArray[np.float64]) -> float:
     return float(np.median(np.linalg.norm(np.diff(positions, 2, axis=0), axis=1)) / math.sqrt(6))
 
 
-def goal_apart(shown: Demonstration) -> float:
-    """Distance of the goal from the start; a ValueError if it vanishes beside the motion's size."""
-    gap = float(torch.linalg.vector_norm(shown.goal - shown.start))
+def goal_apart(shown: Demonstration, goal: Tensor) -> float:
+    """Distance of ``goal`` (n,) from the start; a ValueError if it vanishes beside the motion's size."""
+    gap = float(torch.linalg.vector_norm(goal - shown.start))
     if not gap > CLOSED * shown.size:
         share = f"{gap / shown.size:.1e} of its size"
         raise ValueError(f"demonstration: expected a goal apart from the start, got a closed loop ({share})")

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch._compile import _disable_dynamo
+from torch.autograd import forward_ad
 
 from .arguments import check_points, check_precision, whole_number
 from .kernels import translations
 
 Self = TypeVar("Self", bound="Diffeomorphism")
+Method = TypeVar("Method", bound=Callable[..., Any])
 
 WIDTH_BOUND = math.sqrt(math.e / 2)
 """A layer x + exp(-ρ²‖x-c‖²) v is invertible while ρ‖v‖ < √(e/2) (Perrin and Schlehuber-Caissier 2016)."""
@@ -106,6 +110,21 @@ class Layers(NamedTuple):
     """(m,) ρ > 0"""
 
 
+def eager_for_derivatives(method: Method) -> Method:
+    """Leave the graph of torch.compile for calls whose derivative is asked: a loop there has none, or a wrong one."""
+    eager = _disable_dynamo(method)  # as torch.compiler.disable, without a second of imports
+
+    @functools.wraps(method)
+    def call(self: nn.Module, *tensors: Tensor) -> Any:
+        if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
+            asked = torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors, *self.parameters()))
+            if asked or torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
+                return eager(self, *tensors)  # under fullgraph=True freeze it, or call it within torch.no_grad()
+        return method(self, *tensors)
+
+    return cast(Method, call)
+
+
 class LocallyWeightedTranslations(Diffeomorphism):
     """ψ = ψ_M ∘ … ∘ ψ_1 with layers ψ_j(x) = x + exp(-ρ_j² ‖x - c_j‖²) v_j (paper, Sec. VI; Perrin 2016, eq. 5).
 
@@ -175,61 +194,45 @@ class LocallyWeightedTranslations(Diffeomorphism):
         self.log_widths.zero_()[:used] = widths.log().to(self.log_widths)
         self.log_widths[used:] = self.log_widths[:used].mean() if used else 0.0
 
+    @eager_for_derivatives
     def forward(self, x: Tensor) -> Tensor:
         check_points(self.dim, x, "x")
         if translations.can_use_kernel(self, x):
             return translations.forward(self, x)
-        for c, v, q in self._layers():
-            x = x + torch.exp(-q * (x - c).square().sum(-1, keepdim=True)) * v
-        return x
+        return self._through(_translate, x)[0]
 
+    @eager_for_derivatives
     def inverse(self, y: Tensor) -> Tensor:
         check_points(self.dim, y, "y")
         if translations.can_use_kernel(self, y):
             return translations.inverse(self, y)
-        for c, v, q in reversed(self._layers()):
-            y = y - _root(y - c, v, q) * v
-        return y
+        return self._through(_untranslate, y, reverse=True)[0]
 
+    @eager_for_derivatives
     def linearize(self, y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         check_points(self.dim, y, "y")
         if translations.can_use_kernel(self, y):
             return translations.linearize(self, y)
-        steps = []
-        for c, v, q in reversed(self._layers()):
-            k = _root(y - c, v, q)
-            y = y - k * v
-            steps.append((-2 * q * k * (y - c), v))
+        x = self.inverse(y)
+        return x, functools.partial(self._pushed, x)
 
-        def push(tangent: Tensor) -> Tensor:
-            for gradient, v in reversed(steps):
-                tangent = tangent + (gradient * tangent).sum(-1, keepdim=True) * v
-            return tangent
+    @eager_for_derivatives
+    def _pushed(self, x: Tensor, tangent: Tensor) -> Tensor:
+        points, tangents = torch.broadcast_tensors(x, tangent)  # type: ignore[no-untyped-call]
+        return self._through(_push, points, tangents.unsqueeze(-2))[1].squeeze(-2)
 
-        return y, push
-
+    @eager_for_derivatives
     def jacobian(self, x: Tensor) -> Tensor:
         check_points(self.dim, x, "x")
         if translations.can_use_kernel(self, x):
             return translations.jacobian(self, x)
         columns = torch.eye(self.dim, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], self.dim, self.dim)
-        for c, v, q in self._layers():
-            w = x - c
-            k = torch.exp(-q * w.square().sum(-1, keepdim=True))
-            x = x + k * v
-            row = ((-2 * q * k * w).unsqueeze(-2) @ columns).squeeze(-2)
-            columns = columns + v.unsqueeze(-1) * row.unsqueeze(-2)
-        return columns
+        return self._through(_push, x, columns)[1].mT
 
+    @eager_for_derivatives
     def log_abs_det_jacobian(self, x: Tensor) -> Tensor:
         check_points(self.dim, x, "x")
-        total = torch.zeros_like(x[..., 0])
-        for c, v, q in self._layers():
-            w = x - c
-            k = torch.exp(-q * w.square().sum(-1, keepdim=True))
-            total = total + torch.log1p((-2 * q * k * w * v).sum(-1))  # matrix determinant lemma
-            x = x + k * v
-        return total
+        return self._through(_swell, x, torch.zeros_like(x[..., 0]))[1]
 
     @torch.no_grad()
     def invertibility(self) -> Invertibility:
@@ -261,21 +264,98 @@ class LocallyWeightedTranslations(Diffeomorphism):
 
     def _layers(self) -> list[tuple[Tensor, Tensor, Tensor]]:
         """(c, v, ρ²) of every layer, first to last."""
-        squares = torch.exp(2 * self.log_widths)
-        return list(zip(self.centers.unbind(), self.directions.unbind(), squares.unbind(), strict=True))
+        return list(zip(*(part.unbind() for part in self._stacked()), strict=True))
+
+    def _stacked(self) -> tuple[Tensor, Tensor, Tensor]:
+        """(c, v, ρ²) of all layers: (M, n), (M, n), (M, 1)."""
+        return self.centers, self.directions, torch.exp(2 * self.log_widths).unsqueeze(-1)
+
+    def _through(self, step: Step, *state: Tensor, reverse: bool = False) -> tuple[Tensor, ...]:
+        """``state`` after the step of every layer, first to last or the other way round."""
+        if torch.compiler.is_compiling():
+            return _loop_in_graph(step, self._stacked(), state, reverse)
+        layers = self._layers()
+        for layer in reversed(layers) if reverse else layers:
+            state = step(*layer, *state)
+        return state
+
+
+Step = Callable[..., tuple[Tensor, ...]]
+"""What one layer (c, v, ρ²) does to a state: (c, v, ρ², *state) -> state."""
+
+
+def _translate(c: Tensor, v: Tensor, q: Tensor, x: Tensor) -> tuple[Tensor]:
+    return (x + torch.exp(-q * (x - c).square().sum(-1, keepdim=True)) * v,)
+
+
+def _untranslate(c: Tensor, v: Tensor, q: Tensor, y: Tensor) -> tuple[Tensor]:
+    return (y - _root(y - c, v, q) * v,)
+
+
+def _push(c: Tensor, v: Tensor, q: Tensor, x: Tensor, tangents: Tensor) -> tuple[Tensor, Tensor]:
+    """Tangents (..., T, n) at x."""
+    w = x - c
+    k = torch.exp(-q * w.square().sum(-1, keepdim=True))
+    along = (tangents * (-2 * q * k * w).unsqueeze(-2)).sum(-1, keepdim=True)
+    return x + k * v, tangents + along * v
+
+
+def _swell(c: Tensor, v: Tensor, q: Tensor, x: Tensor, log_volume: Tensor) -> tuple[Tensor, Tensor]:
+    w = x - c
+    k = torch.exp(-q * w.square().sum(-1, keepdim=True))
+    return x + k * v, log_volume + torch.log1p((-2 * q * k * w * v).sum(-1))  # matrix determinant lemma
+
+
+def _loop_in_graph(
+    step: Step, layers: tuple[Tensor, ...], state: tuple[Tensor, ...], reverse: bool
+) -> tuple[Tensor, ...]:
+    """The loop over the layers as one node of a graph, whose size so does not grow with their number.
+
+    torch.export records a ``scan``, which is differentiable; torch.compile a ``while_loop``, as its default compiler
+    takes a scan under ``fullgraph=True`` alone. On the CPU both compute in float64, as the kernels do.
+    """
+    from torch._higher_order_ops import scan, while_loop  # takes a second
+
+    def widened(tensor: Tensor) -> Tensor:
+        return (tensor.double() if tensor.is_cpu else tensor).contiguous()
+
+    layers, start = tuple(map(widened, layers)), tuple(map(widened, state))
+    if torch.compiler.is_exporting():
+
+        def one(state: tuple[Tensor, ...], layer: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], Tensor]:
+            return step(*layer, *state), layer[-1].clone()  # a scan must also hand out something
+
+        end, _ = scan(one, start, layers, reverse=reverse)
+    else:
+        count = len(layers[0])
+        first, stride = (count - 1, -1) if reverse else (0, 1)
+
+        def unfinished(index: Tensor, *state: Tensor) -> Tensor:
+            return ((index >= 0) & (index < count)).squeeze()
+
+        def at(index: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+            layer = (part.index_select(0, index).squeeze(0) for part in layers)
+            return index + stride, *step(*layer, *state)
+
+        begin = torch.full((1,), first, device=start[0].device)
+        _, *end = while_loop(unfinished, at, (begin, *start))  # type: ignore[no-untyped-call]
+    return tuple(new.to(old.dtype) for new, old in zip(end, state, strict=True))
+
+
+ROOT_STEPS = 8
+"""After which every root is found; see :func:`_solve`."""
 
 
 def _root(w: Tensor, v: Tensor, q: Tensor) -> Tensor:
     """The one s in [0, 1] with s = exp(-q ‖w - s v‖²), over (..., n) -> (..., 1); differentiable twice.
 
-    Newton's method alone fails on 3-4 % of hard layers; kept inside a shrinking bracket it never did. The root is
-    found without a graph; two free Newton steps from it then carry derivatives up to third order.
+    It is found without a graph; two free Newton steps from it then carry derivatives up to third order.
     """
     a = q * v.square().sum(-1, keepdim=True)
     b = q * (w * v).sum(-1, keepdim=True)
     c = q * w.square().sum(-1, keepdim=True)
     with torch.no_grad():
-        s = _bracketed_root(a.detach(), b.detach(), c.detach())
+        s = _solve(a.detach(), b.detach(), c.detach())
     if torch.is_grad_enabled():
         for _ in range(2):
             k = torch.exp(-((a * s - 2 * b) * s + c).clamp(min=0))
@@ -283,25 +363,32 @@ def _root(w: Tensor, v: Tensor, q: Tensor) -> Tensor:
     return s
 
 
-def _bracketed_root(a: Tensor, b: Tensor, c: Tensor, max_steps: int = 64) -> Tensor:
-    low, high = torch.zeros_like(c), torch.ones_like(c)
-    s = torch.exp(-c)
-    tolerance = 4 * torch.finfo(c.dtype).eps
-    for _ in range(max_steps):
-        k = torch.exp(-((a * s - 2 * b) * s + c).clamp(min=0))
+def _solve(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """The root s in [0, 1] of s = k(s) = exp(-(a s² - 2 b s + c)), for a < e/2 and b² <= a c.
+
+    Laguerre's method for cubics, from where k bends over and s - k(s) is flattest: near the invertibility bound it is
+    almost a cubic with a triple root there, which slows other methods down. In t = √(2a) (s - b/a) the equation has two
+    parameters, t + τ = κ exp(-t²/2) with 0 <= κ < √e, and a scan of them (tests/test_diffeomorphism.py) finds
+    |s - k(s)| within 5 rounding errors after eight steps, up to the bound itself; common layers need four.
+    """
+    tiny, eps = torch.finfo(a.dtype).tiny, torch.finfo(a.dtype).eps
+    s = ((b - (a / 2).sqrt()) / a.clamp(min=tiny)).clamp(0, 1)
+    for _ in range(ROOT_STEPS):
+        g = b - a * s
+        k = torch.exp((s * (g + b) - c).clamp(max=0))
         gap = s - k
-        low, high = torch.where(gap < 0, s, low), torch.where(gap > 0, s, high)
-        new = s - gap / (1 - 2 * (b - a * s) * k)
-        new = torch.where((new >= low) & (new <= high), new, (low + high) / 2)
-        moved, s = (new - s).abs(), new
-        if _everywhere((moved <= tolerance * s) | ~(moved > 0)):
+        gap = torch.where(gap.abs() <= 2 * eps, 0.0, gap)  # where s - k is flat, rounding errors would carry s away
+        if _everywhere(gap == 0):
             break
-    return s
+        p = g * k
+        slope = 1 - 2 * p
+        spread = (slope * slope - 3 * gap * (a * k - 2 * g * p)).abs().sqrt()
+        s = (s - 3 * gap / (slope + 2 * spread).clamp(min=tiny)).clamp(0, 1)
+    return torch.where(c > translations.BEYOND, 0.0, s)
 
 
 def _everywhere(done: Tensor) -> bool:
-    """Whether a loop may end early; never under vmap or export, where no value can be read,
-    nor while torch.jit.trace records how many steps one example took."""
+    """Whether a loop may end early; never under vmap, export or tracing, where no value can be read or is the last."""
     if torch.compiler.is_compiling() or torch._C._get_tracing_state() is not None:
         return False
     try:

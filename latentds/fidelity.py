@@ -108,7 +108,8 @@ class System(Protocol):
 class Fidelity:
     """How a system follows what it was shown; of several demonstrations each figure is the worst.
 
-    Sizes are the largest extents of the demonstration along an axis; the motion lasts as long as it.
+    Sizes are the largest extents of the demonstration along an axis. The motion lasts as long as the demonstration, and
+    as the longest of several: the system has one timing for all of them.
 
     Attributes:
         miss: distance of the motion from the demonstrated start and the demonstration: exact DTW over points, in sizes.
@@ -160,7 +161,7 @@ class Fidelity:
             (self.end / (END + allowed), f"is {self.end:.3g} of the size from the end when the demonstration ends"),
             (
                 self.nearby / (NEARBY_MISS + allowed),
-                f"misses by {self.nearby:.3g} of the size from a start {NEAR:.0%} beside the demonstrated one",
+                f"misses by {self.nearby:.3g} of the size from a start beside the demonstrated one",
             ),
             (
                 self.fastest / FASTEST,
@@ -194,8 +195,9 @@ def measure(ds: System, shown: Sequence[Excerpt]) -> Fidelity:
     ball = draw.standard_normal((PLACES, dim + 2))  # the first n coordinates on the sphere of R^(n+2): even in a ball
     ball = (ball / np.linalg.norm(ball, axis=1, keepdims=True))[:, :dim]
     paths = [np.array(one.path) for one in shown]
+    duration = max(one.duration for one in shown)
     every = [
-        _measure(ds, one, path, around[i :: len(shown)], ball[i :: len(shown)])
+        _measure(ds, one, path, duration, around[i :: len(shown)], ball[i :: len(shown)])
         for i, (one, path) in enumerate(zip(shown, paths, strict=True))
     ]
     figures = {name: float(np.max([one[name] for one in every])) for name in every[0]}
@@ -206,13 +208,13 @@ def measure(ds: System, shown: Sequence[Excerpt]) -> Fidelity:
     return Fidelity(**figures, spread=float(np.mean(spread)) if spread else 0.0, shown=tuple(shown))
 
 
-def _measure(ds: System, one: Excerpt, path: Array, around: Array, ball: Array) -> dict[str, float]:
+def _measure(ds: System, one: Excerpt, path: Array, duration: float, around: Array, ball: Array) -> dict[str, float]:
     size, count = _size(path), len(path)
     distance = np.linalg.norm(path - path[0], axis=1)
     away = np.argmax(distance > 2 * NEAR * size)
     near = min(NEAR * size, float(distance[away:].min()) / 4)
     starts = torch.from_numpy(np.concatenate([path[:1], path[0] + near * around])).to(ds.attractor)
-    times = torch.linspace(0, one.duration, count, dtype=torch.float64).to(ds.attractor.device)
+    times = torch.linspace(0, duration, count, dtype=torch.float64).to(ds.attractor.device)
     moved = ds.rollout(starts, times)
     if moved.shape != (len(starts), *path.shape):
         raise ValueError(f"rollout: expected shape {(len(starts), *path.shape)}, got {tuple(moved.shape)}")

@@ -222,6 +222,8 @@ class _Reading:
 
     def _class(self, kind: type) -> list[Any]:
         self._cite(kind.__module__)
+        if kind.__module__.partition(".")[0] == "torch":
+            return [kind.__module__, kind.__qualname__]  # torch.export patches nn.Module's own methods as it goes
         found: list[Any] = [kind.__qualname__, *kind.__bases__]
         for name, value in sorted(vars(kind).items()):
             about = name.startswith("__") and not callable(value) and not hasattr(type(value), "__get__")

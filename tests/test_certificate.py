@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from baselines import SDSEF
-from latentds import LatentDS, LocallyWeightedTranslations, StableDS, TubeDS, certify
+from latentds import Demonstration, LatentDS, LocallyWeightedTranslations, StableDS, TubeDS, certify
 from latentds.dynamics import RayDynamics
 from latentds.testing import wavy_motion
 from latentds.time_law import PiecewiseLinearLaw
@@ -106,10 +106,18 @@ class BreaksTheBound(Sound):
 class Folds(Sound):
     """decode(encode(y)) is y still, yet ψ has two sheets."""
 
+    larger = 1.0
+
     def jacobian(self, x):
         x = torch.as_tensor(x)
-        side = torch.where(x[..., :1] > 0, 1.0, -1.0).to(x.dtype)
+        side = torch.where(x[..., :1] > 0, self.larger, -self.larger).to(x.dtype)
         return super().jacobian(x) * torch.cat([side, torch.ones_like(side)], -1).unsqueeze(-2)
+
+
+class FoldsTheOtherWay(Folds):
+    """Most of space is turned over, and the rest is not."""
+
+    larger = -1.0
 
 
 class HasAWrongJacobian(Sound):
@@ -134,6 +142,13 @@ class NeverArrives(Sound):
         ball = 0.1 * torch.nn.functional.normalize(start - self.attractor, dim=-1)
         keeps = (start - self.attractor).norm(dim=-1, keepdim=True) > 0.1
         return torch.where(keeps, self.attractor + ball + 0.9 * (paths - self.attractor - ball), start)
+
+
+class Drifts(Sound):
+    """Its velocity at the attractor is 0, but its motions do not know."""
+
+    def rollout(self, y0, t):
+        return super().rollout(y0, t) + 1e-3 * (t - t[0]).unsqueeze(-1)
 
 
 class DividesByZero(Sound):
@@ -205,6 +220,8 @@ BROKEN = {
     RestsElsewhereTangentially: "no equilibrium",
     BreaksTheBound: "every layer is invertible",
     Folds: "neither folds nor flattens",
+    FoldsTheOtherWay: "neither folds nor flattens",
+    Drifts: "the attractor rests",
     HasAWrongJacobian: "Jacobian is autograd's",
     EncodesWrongly: "decode inverts encode",
     MovesAtTheGoal: "the attractor rests",
@@ -243,6 +260,26 @@ def test_counterexample_is_the_planted_equilibrium(stub):
     assert line.counterexample == pytest.approx(stub.place, abs=1e-4)
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_ascent_finds_what_few_samples_miss(seed):
+    """Samples alone find the place where V rises with three of these seeds."""
+    certificate = certify(FlipsTheSignSomewhere(), n_samples=80, seed=seed)
+    (line,) = [line for line in certificate.falsified if "V decreases" in line.claim]
+    assert np.linalg.norm(np.subtract(line.counterexample, FlipsTheSignSomewhere.place)) < 0.15
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e9])
+def test_units_change_no_verdict(scale):
+    shown = wavy_motion(2)
+    ds = TubeDS(2, n_layers=30, refined=False).fit(Demonstration(scale * shown.positions, shown.dt))
+    certificate = certify(ds, n_samples=40)
+    assert certificate.holds, str(certificate)
+
+
+def test_the_region_is_the_one_that_was_asked_for():
+    assert certify(Sound(), [[-1, -2], [3, 4]], n_samples=20).region == ((-1, -2), (3, 4))
+
+
 def test_counterexample_of_the_bound_is_where_space_folds():
     ds = BreaksTheBound()
     (line,) = [line for line in certify(ds).falsified if "layer" in line.claim]
@@ -250,7 +287,6 @@ def test_counterexample_of_the_bound_is_where_space_folds():
     assert np.isfinite(line.counterexample).all()
 
 
-@pytest.mark.slow
 class Vinograd(StableDS):
     """Attractive and unstable (Vinograd 1957; Hahn, Stability of Motion, section 40): all motions end at 0, and from
     as near as one likes some go far first. No V proves it stable; this one does not even try.

@@ -10,7 +10,7 @@ import torch
 from scipy.optimize import brentq
 
 from baselines.couplings import AffineCouplings
-from latentds import LocallyWeightedTranslations
+from latentds import LocallyWeightedTranslations, diffeomorphism
 from latentds.diffeomorphism import WIDTH_BOUND
 
 
@@ -116,21 +116,29 @@ def test_functional_transforms(points, dim):
         torch.testing.assert_close(pushed, (reverse @ tangent.unsqueeze(-1)).squeeze(-1), rtol=1e-9, atol=1e-9)
 
 
-def test_export():
-    """Few layers: the solver of the inverse is unrolled, which takes seconds a layer."""
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("early", [True, False])
+def test_eight_steps_find_every_root(dtype, early, monkeypatch):
+    """With t = √(2a)(s - b/a) the equation is t + τ = κ exp(-t²/2), κ = √(2a) exp(-p): all of κ < √e and of τ.
 
-    class Inverse(torch.nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.psi = random_psi(3, 1)
-
-        def forward(self, y):
-            return self.psi.inverse(y)
-
-    x = torch.randn(5, 3, dtype=torch.float64)
-    for module in (random_psi(3, 4), Inverse()):
-        exported = torch.export.export(module, (x,)).module()
-        torch.testing.assert_close(exported(x), module(x), rtol=1e-12, atol=1e-12)
+    Where a reaches the bound e/2, p is 0 and τ is 2, the root is threefold.
+    """
+    if not early:
+        monkeypatch.setattr(diffeomorphism, "_everywhere", lambda done: False)
+    eps = torch.finfo(dtype).eps
+    a = math.e / 2 * torch.cat([1 - torch.logspace(-17, -0.1, 30, dtype=torch.float64), torch.logspace(-40, -1, 5)])
+    p = torch.cat([torch.zeros(1), torch.logspace(-17, 2, 60, dtype=torch.float64)])
+    beside = torch.logspace(-16, 0.5, 100, dtype=torch.float64)
+    tau = torch.cat([torch.linspace(-30, 30, 601), 2 + beside, 2 - beside, torch.tensor([-1e6, 1e6])])
+    a, p, tau = torch.meshgrid(a.double(), p.double(), tau.double(), indexing="ij")
+    s0 = tau / (2 * a).sqrt()
+    a, b, c = (part.to(dtype) for part in (a, a * s0, p + a * s0.square()))
+    s = diffeomorphism._solve(a, b, c)
+    a, b, c, s = (part.numpy().astype(np.longdouble) for part in (a, b, c, s))
+    with np.errstate(over="ignore", invalid="ignore"):
+        k = np.exp(np.minimum(s * (2 * b - a * s) - c, 0))
+    assert ((s >= 0) & (s <= 1)).all()
+    assert np.abs(s - k).max() <= 20 * eps
 
 
 def test_bound_holds_by_parametrisation(dim):

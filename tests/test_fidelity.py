@@ -230,7 +230,7 @@ class Diverges(Follower):
 
 PLANTED = {
     IsLate: "of the size from the end when the demonstration ends",
-    Scatters: "of the size from a start 1% beside the demonstrated one",
+    Scatters: "of the size from a start beside the demonstrated one",
     Races: "times as fast as shown within 10% of the size from the path",
     Rises: "V rises by 0.0",
     DependsOnTheTime: "its motion begun anew half-way is another one",

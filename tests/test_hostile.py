@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import sys
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -13,8 +14,8 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import seed as seeded
 
 from baselines import FDM, SDSEF
-from experiments.fuzz import FLAWS, FOLLOWS, METHODS, SHAPES, Case, cases, outcome, summary
-from latentds import ChebyshevDS, TubeDS, datasets
+from experiments.fuzz import FLAWS, FOLLOWS, METHODS, SAYS, SHAPES, SLOW, Case, cases, outcome, summary
+from latentds import ChebyshevDS, Demonstration, TubeDS, datasets
 from latentds.testing import wavy_motion
 
 
@@ -32,23 +33,26 @@ def test_hostile_demonstrations(case):
 PLAIN = Case("FDM", "smooth", "none", "float64", 100, 2, 1.0, 0.0, 0.01, 0)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_harmless_demonstrations_are_fitted(method):
-    assert outcome(PLAIN._replace(method=method, dim=1, shape="collinear")) == FOLLOWS
+FITTED = [pytest.param(name, marks=[pytest.mark.slow] * (name == SLOW)) for name in METHODS]
+
+
+@pytest.mark.parametrize("name", FITTED)
+def test_harmless_demonstrations_are_fitted(name):
+    assert outcome(PLAIN._replace(method=name, dim=1, shape="collinear")) == FOLLOWS
     for dim in (2, 10):
-        assert outcome(PLAIN._replace(method=method, dim=dim)) == FOLLOWS
+        assert outcome(PLAIN._replace(method=name, dim=dim)) == FOLLOWS
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", FITTED)
 @pytest.mark.parametrize("form", ["float32", "float16", "strided", "transposed", "requires_grad", "numpy", "list"])
-def test_every_form_is_taken(method, form):
-    assert outcome(PLAIN._replace(method=method, form=form)) == FOLLOWS
+def test_every_form_is_taken(name, form):
+    assert outcome(PLAIN._replace(method=name, form=form)) == FOLLOWS
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", FITTED)
 @pytest.mark.parametrize(("scale", "offset"), [(1e-9, 0.0), (1e9, 0.0), (1.0, 1e6)])
-def test_every_scale_is_taken(method, scale, offset):
-    assert outcome(PLAIN._replace(method=method, scale=scale, offset=offset, dim=3)) == FOLLOWS
+def test_every_scale_is_taken(name, scale, offset):
+    assert outcome(PLAIN._replace(method=name, scale=scale, offset=offset, dim=3)) == FOLLOWS
 
 
 def told_apart(cases):
@@ -78,7 +82,7 @@ def test_every_shape_and_every_flaw_is_alive(dim):
 @pytest.mark.parametrize("flaw", ["nan", "inf"])
 @pytest.mark.parametrize("seed", range(4))
 def test_numbers_that_are_none_are_refused_by_name(flaw, seed):
-    assert outcome(PLAIN._replace(flaw=flaw, seed=seed)).startswith("ValueError: positions: expected finite numbers")
+    assert outcome(PLAIN._replace(flaw=flaw, seed=seed)).startswith("refused: positions: expected finite numbers")
 
 
 def test_the_fuzzer_tells_a_broken_promise(monkeypatch):
@@ -94,12 +98,31 @@ def test_the_fuzzer_tells_a_broken_promise(monkeypatch):
         def fit(self, demonstration, *, progress=False):
             raise ValueError("no")
 
-    for broken, message in {Unstable: "V decreases", Crashes: "IndexError: off by one", Mumbles: "names no"}.items():
+    class Forgets(FDM):
+        """Learns a part, and keeps the measurement out."""
+
+        def fit(self, demonstration, *, progress=False):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                return super().fit(Demonstration(demonstration.positions[-30:], demonstration.dt), progress=progress)
+
+        fit.measured = True
+
+    stubs = {Unstable: "V decreases", Crashes: "off by one", Mumbles: "names no", Forgets: "a silent misfit off by"}
+    for broken, message in stubs.items():
         monkeypatch.setitem(METHODS, "broken", broken)
         found = outcome(PLAIN._replace(method="broken"))
         assert found.startswith("BROKEN")
         assert message in found
         assert "1  BROKEN" in summary([(PLAIN, found, 0.1)])
+
+
+def test_the_summary_counts_each_end_of_each_method():
+    ends = [FOLLOWS, SAYS, SAYS, "refused: dt: expected a number > 0, got -1", "BROKEN certificate: falsified  V (x 1)"]
+    told = summary([(PLAIN, found, 0.1) for found in ends] + [(PLAIN._replace(method="TubeDS"), FOLLOWS, 2.0)])
+    assert told.startswith("6 cases, slowest 2.0 s\n")
+    assert "| FDM | 1 | 2 | 1 | 1 |\n| TubeDS | 1 | 0 | 0 | 0 |\n" in told
+    assert "     1  refused: dt: expected a number > 0\n     1  BROKEN certificate: falsified V" in told
 
 
 @pytest.fixture

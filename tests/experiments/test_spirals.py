@@ -16,8 +16,8 @@ from latentds.benchmark import COLUMNS
 def made_up(score):
     """Rows of two methods on two spirals, scores by a function of (method, spiral, start)."""
     rows = [
-        {"method": m, "demonstration": d, "seed": 0, "start": s, "status": "ok", "error": "", "converged": True}
-        | {"dtw": score(m, d, s), "dtw_fast": score(m, d, s), "mse": 1e-6}
+        {"method": m, "demonstration": d, "seed": 0, "start": s, "status": "ok", "error": "", "follows": True}
+        | {"converged": True, "dtw": score(m, d, s), "dtw_fast": score(m, d, s), "mse": 1e-6}
         for d in ("unstable c=3", "unstable c=7")
         for m in ("Chebyshev", "FDM")
         for s in range(5)
@@ -48,6 +48,17 @@ def test_p_values_are_paired_and_welchs():
     rows = made_up(lambda m, d, s: 10 + noise[s] + (0.1 + 0.01 * s if m == "FDM" else 0))
     paired, welch = line(summary_of(rows), "exact DTW over", "unstable c=3").split("|")[-2].split("/")
     assert float(paired) < 0.001 < 0.5 < float(welch)  # a small, steady difference under a large shared spread
+
+
+def test_fits_that_do_not_follow_are_told_for_each_spiral_and_seed():
+    first = made_up(lambda m, d, s: 1.0)
+    off = first.assign(seed=1, follows=first["method"] != "FDM")
+    off.loc[(off["method"] == "Chebyshev") & (off["demonstration"] == "unstable c=3"), "method"] = "third"
+    assert line(summary_of(first), "Fits that follow", "unstable c=7") == "| unstable c=7 | yes | yes |"
+    assert line(summary_of(off), "Fits that follow", "unstable c=7") == "| unstable c=7 | yes | **no** |"
+    assert line(summary_of(off), "Fits that follow", "unstable c=3") == "| unstable c=3 | — | **no** |"
+    both = line(summary_of(pd.concat([first, off])), "Fits that follow", "unstable c=7")
+    assert both == "| unstable c=7 | yes | 1 of 2 seeds |"
 
 
 def test_seeds_stand_side_by_side_for_the_methods_that_they_change():

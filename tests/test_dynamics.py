@@ -1,0 +1,85 @@
+"""Latent dynamics beside their flows: what they promise of the rate, and when they can be written as tables."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from latentds.dynamics import Frame, LatentDynamics, RayDynamics, TubeDynamics
+from latentds.time_law import ChebyshevLaw, PiecewiseLinearLaw
+
+FAST = PiecewiseLinearLaw([0.1, 1.0], [1.0, 10.0])
+SLOW = PiecewiseLinearLaw([0.1, 0.4, 1.0], [0.2, 0.05, 0.9])
+DYNAMICS = {
+    "ray": RayDynamics(SLOW),
+    "ray, Chebyshev": RayDynamics(ChebyshevLaw(2.0)),
+    "slow along": TubeDynamics(SLOW, FAST),
+    "slow across": TubeDynamics(FAST, SLOW),
+    "Chebyshev along": TubeDynamics(ChebyshevLaw(2.0), FAST),
+}
+
+
+def frame(dim, draw):
+    return Frame.between(*torch.randn(2, dim, generator=draw, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("name", DYNAMICS)
+@pytest.mark.parametrize("reach", [0.3, 2.0])
+def test_the_bound_on_the_rate_is_the_least_rate(name, reach, draw):
+    """Nowhere is -V̇/2V below it, and along the axis or across it comes close: the slower of both laws counts."""
+    dynamics, at = DYNAMICS[name], frame(3, draw)
+    across = torch.linalg.cross(at.axis, at.axis.roll(1))
+    ways = [torch.randn(500, 3, generator=draw, dtype=torch.float64), at.axis.expand(500, 3), across.expand(500, 3)]
+    share = torch.linspace(1e-3, 1, 500, dtype=torch.float64).repeat(3).unsqueeze(-1)
+    offset = reach * at.length * share * torch.nn.functional.normalize(torch.cat(ways), dim=-1)
+    x = at.attractor + offset
+    rates = -(dynamics(x, x, at) * offset).sum(-1) / offset.square().sum(-1)
+    bound = dynamics.convergence_rate_bound(float(reach * at.length), at)
+    assert 0 < bound <= rates.min() * (1 + 1e-9)
+    assert bound == pytest.approx(float(rates.min()), rel=0.05)
+
+
+@pytest.mark.parametrize("name", DYNAMICS)
+def test_a_frame_that_is_none_bounds_nothing(name, draw):
+    dynamics, at = DYNAMICS[name], frame(3, draw)
+    frames = [
+        at._replace(length=-at.length),
+        at._replace(length=0 * at.length),
+        at._replace(length=math.nan * at.length),
+    ]
+    if isinstance(dynamics, TubeDynamics):
+        frames += [at._replace(axis=(1 + 1e-9) * at.axis), at._replace(axis=math.nan * at.axis)]
+    assert all(not dynamics.convergence_rate_bound(1.0, broken) > 0 for broken in frames)
+
+
+class OtherLaw(PiecewiseLinearLaw):
+    pass
+
+
+class OtherTube(TubeDynamics):
+    pass
+
+
+@pytest.mark.parametrize("law", [FAST, ChebyshevLaw()])
+def test_tables_are_of_the_dynamics_themselves_and_of_no_subclass(law, draw):
+    """A subclass may move otherwise; what reads the tables would not know."""
+    at, other = frame(3, draw), OtherLaw([1.0], [1.0])
+    goal, along, across = TubeDynamics(law, SLOW).tables(at)
+    assert (goal == torch.stack([at.attractor, at.axis, at.length.expand(3)]).numpy()).all()
+    assert (along == law.table()).all()
+    assert (across == SLOW.table()).all()
+    goal, along, across = RayDynamics(law).tables(at)
+    assert (goal[1] == 0).all()
+    assert (along == law.table()).all()
+    assert (across == law.table()).all()
+    unknown = [RayDynamics(other), TubeDynamics(other, law), TubeDynamics(law, other), OtherTube(law, SLOW)]
+    assert [dynamics.tables(at) for dynamics in unknown] == [None] * 4
+
+
+@pytest.mark.parametrize("missing", ["forward", "flow"])
+def test_dynamics_without_a_velocity_or_a_flow_are_none(missing):
+    methods = {name: getattr(RayDynamics, name) for name in ("forward", "flow") if name != missing}
+    with pytest.raises(TypeError, match=missing):
+        type("Half", (LatentDynamics,), methods)()
