@@ -18,6 +18,7 @@ def blocks():
             yield pytest.param(block, id=f"{page.relative_to(ROOT)}-{number}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("block", list(blocks()))
 def test_code_runs_as_printed(block, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

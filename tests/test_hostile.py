@@ -36,7 +36,8 @@ PLAIN = Case("FDM", "smooth", "none", "float64", 100, 2, 1.0, 0.0, 0.01, 0)
 FITTED = [pytest.param(name, marks=[pytest.mark.slow] * (name == SLOW)) for name in METHODS]
 
 
-@pytest.mark.parametrize("name", FITTED)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", METHODS)
 def test_harmless_demonstrations_are_fitted(name):
     assert outcome(PLAIN._replace(method=name, dim=1, shape="collinear")) == FOLLOWS
     for dim in (2, 10):

@@ -247,7 +247,12 @@ class Descent(StableDS):
 
 @pytest.mark.parametrize(
     ("settings", "dim", "fitted"),
-    [({}, 1, [False, True]), ({}, 7, [True]), ({"bent": True}, 3, [True]), ({"fastest": 100.0}, 2, [True])],
+    [
+        ({}, 1, [False, True]),
+        pytest.param({}, 7, [True], marks=pytest.mark.slow),
+        ({"bent": True}, 3, [True]),
+        pytest.param({"fastest": 100.0}, 2, [True], marks=pytest.mark.slow),
+    ],
     ids=["linear, 1-D", "linear, 7-D", "bent", "stiff"],
 )
 def test_fit_forward_and_lyapunov_make_a_method(settings, dim, fitted):

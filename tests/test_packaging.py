@@ -64,6 +64,7 @@ def installed(source, tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_every_file_of_the_packages_is_in_the_wheel_and_imports_from_there(source, installed, tmp_path):
     wanted = {p.relative_to(source).as_posix() for name in PACKAGES for p in (source / name).rglob("*") if p.is_file()}
     packed = {p.relative_to(installed).as_posix() for p in installed.rglob("*") if p.is_file()}
@@ -74,6 +75,7 @@ def test_every_file_of_the_packages_is_in_the_wheel_and_imports_from_there(sourc
     assert set(found.split()) == {path for path in wanted if path.endswith(".py")}
 
 
+@pytest.mark.slow
 def test_a_bare_install_saves_and_loads(installed, tmp_path):
     (metadata,) = installed.glob("*.dist-info/METADATA")
     needs = message_from_string(metadata.read_text(encoding="utf-8")).get_all("Requires-Dist")

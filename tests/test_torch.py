@@ -213,6 +213,7 @@ class Velocities(Dataset):
             return self.ds(self.chunks[index])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["FDM", "SDSEF"])
 @torch.no_grad()
 def test_workers_of_a_data_loader_compute_what_we_do(kind):

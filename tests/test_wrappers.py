@@ -31,6 +31,7 @@ KINDS = {
 }
 
 
+@pytest.mark.slow
 @parametrize_stable_ds(
     {
         "turned": lambda dim: KINDS["TubeDS"](dim).transformed(rotation=turn(dim), scale=2.0).slowed(1.5),

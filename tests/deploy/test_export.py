@@ -35,6 +35,7 @@ def _forget_compiled():
     torch._dynamo.reset()
 
 
+@pytest.mark.slow
 def test_export_and_compile(make_field, positions, assert_same_velocity):
     """All at once, in small; one trace of the root takes seconds."""
     ds = make_field(3, n_layers=3).requires_grad_(False)

@@ -193,7 +193,9 @@ def test_bad_demonstrations(method):
         assert bool((ds.attractor == 0).all())
 
 
-@pytest.mark.parametrize("method", [*TABLE_I, TubeDS], ids=lambda method: method.__name__)
+@pytest.mark.parametrize(
+    "method", [*TABLE_I, pytest.param(TubeDS, marks=pytest.mark.slow)], ids=lambda method: method.__name__
+)
 @pytest.mark.parametrize("gap", [0.0, 1e-7])
 def test_a_fit_that_fails_leaves_the_last_one(method, gap):
     """Here the goal lies so near the start that no latent line leads from one to the other."""
