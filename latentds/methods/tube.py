@@ -18,15 +18,33 @@ from ..base import FitReport, LatentDS
 from ..demonstration import Demonstration, demonstrations_of
 from ..diffeomorphism import Layers, LocallyWeightedTranslations
 from ..dynamics import TubeDynamics
+from ..fidelity import Excerpt, measure
 from ..fitting.embedding import arc_length_path, map_to_endpoints, straight_column
-from ..fitting.homotopy import curvature_homotopy, linear_homotopy
-from ..fitting.matching import apply_layers, match_along, restore_on_failure
+from ..fitting.homotopy import (
+    clear_direction,
+    curvature_homotopy,
+    drawn_homotopy,
+    linear_homotopy,
+    zoom_homotopy,
+)
+from ..fitting.matching import apply_layers, match_along, restore_on_failure, track
 from ..fitting.refinement import refine
+from ..fitting.strands import clearance, crowded, segment_distances
 from ..metrics import dtw
 from ..time_law import PiecewiseLinearLaw
 
 Array = NDArray[np.float64]
 
+DEPTHS = (300, 1000, 8000)
+"""Layers where none are asked for: of the first try; of one more; at most of matches that track a homotopy closely."""
+START_MISS = 0.005
+"""Largest distance of the motion from the demonstrated start and the path, in its sizes, that a fit is content with."""
+FINE = 500
+"""Steps of a homotopy that is tracked; it takes several at once where strands are far apart."""
+CLEAR = 0.02
+"""Least share of their distance that strands keep on a linear homotopy worth tracking."""
+MOST_POINTS = 2000
+"""Points, denser where strands are close, that ψ is then matched on."""
 N_POINTS = 600
 """Points, even in arc length, that ψ is matched on."""
 LINEAR = ((20, 1.0), (20, 2.0), (20, 4.0), (5, 2.0), (5, 4.0))
@@ -90,7 +108,7 @@ class TubeDS(LatentDS):
 
     Args:
         dim: n >= 1.
-        n_layers: M >= 1.
+        n_layers: M >= 1; None for 300, or as many as it takes to follow the path: see ``DEPTHS``.
         contraction: κ > 0, per duration of the demonstration: a start off the path comes back within about
             3/κ of it. A larger κ costs proportionally larger velocity gradients (see the report).
         refined: whether L-BFGS refines the match; without it a fit takes a tenth of the time.
@@ -105,14 +123,14 @@ class TubeDS(LatentDS):
         self,
         dim: int,
         *,
-        n_layers: int = 300,
+        n_layers: int | None = None,
         contraction: float = 20.0,
         refined: bool = True,
         homotopy: str = "both",
     ) -> None:
         along, across = PiecewiseLinearLaw.uniform(), PiecewiseLinearLaw(torch.ones(1), torch.ones(1))
         super().__init__(dim, LocallyWeightedTranslations(dim, n_layers), TubeDynamics(along, across))
-        self.n_layers = self.diffeomorphism.n_layers
+        self.n_layers = n_layers
         self.contraction = number_in(contraction, "contraction", 0, float("inf"))
         self.refined = bool(refined)
         known = ("linear", "curvature", "both") if self.dim > 1 else ("linear", "both")
@@ -132,7 +150,7 @@ class TubeDS(LatentDS):
         with restore_on_failure(self, shown):
             law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
             judged = []
-            for candidate in _candidates(path, self.diffeomorphism.n_layers, self.homotopy):
+            for candidate in _candidates(path, self.n_layers or DEPTHS[0], self.homotopy):
                 self._take(candidate, shape, law)
                 judged.append((self._score(shape), candidate))
             judged.sort(key=lambda pair: pair[0])
@@ -145,9 +163,12 @@ class TubeDS(LatentDS):
                     better = candidate.refined(path)
                     self._take(better, shape, law)
                     judged.append((self._score(shape), better))
-            best = min(judged, key=lambda pair: pair[0])[1].placed(origin, unit)
+            found, notes = min(judged, key=lambda pair: pair[0])[1], ()
+            if self.n_layers is None:
+                found, notes = self._followed(found, path, shape, law)
+            best = found.placed(origin, unit)
             self._take(best, shown, law)
-            report = self._report(best, origin + unit * path, shown, spread, began)
+            report = replace(self._report(best, origin + unit * path, shown, spread, began), notes=notes)
             self.fit_report = replace(report, learned_from=tuple(one.fingerprint for one in every))
         return self
 
@@ -181,6 +202,40 @@ class TubeDS(LatentDS):
         score = (3 * misses[0] + float(np.mean(misses[1:]))) * math.sqrt(condition)
         score *= max(1.0, condition / MAX_CONDITION)
         return score if math.isfinite(score) else math.inf
+
+    def _followed(
+        self, found: Candidate, path: Array, shape: Demonstration, law: PiecewiseLinearLaw
+    ) -> tuple[Candidate, tuple[str, ...]]:
+        """The match that was found, or a deeper one, the first that follows the path; what stood in the way if none."""
+        even = torch.linspace(0, float(law.time_to_go(torch.ones(()))), ROWS * 8, dtype=torch.float64)
+        share = 1 - law.progress_at(law.time_to_go(torch.ones((), dtype=torch.float64)) - even).clamp(0, 1).numpy()
+        share[-1] = 1
+        timed = np.stack([np.interp(share, np.linspace(0, 1, len(path)), column) for column in path.T], 1)
+        wanted = (Excerpt.of(Demonstration(timed, float(even[1]))),)
+
+        def badness(candidate: Candidate) -> float:
+            self._take(candidate, shape, law)
+            told = measure(self, wanted)
+            return max(told.miss / START_MISS, *(bad for bad, _ in told.findings))
+
+        best, least, dense = found, badness(found), crowded(path, MOST_POINTS)
+        tried = [] if least <= 1 else _deeper(path, dense, self.homotopy)
+        again: list[tuple[float, Candidate]] = []
+        for candidate in tried:
+            again.append((badness(candidate), candidate))
+            if again[-1][0] <= 1:
+                break
+        else:
+            for bad, candidate in sorted(again, key=lambda pair: pair[0])[: TRIES if self.refined else 0]:
+                better = candidate.refined(dense, 100) if len(candidate.line) == len(dense) else candidate.refined(path)
+                again.append((badness(better), better))
+                if again[-1][0] <= 1:
+                    break
+        best, least = min([(least, best), *again], key=lambda pair: pair[0])[::-1]
+        if least <= 1:
+            return best, ()
+        near = float(clearance(path, N_POINTS).min())
+        return best, (f"no match tried follows the path closely; its strands come within {near:.2g} of its size",)
 
     def _line(self) -> Tensor:
         """Latent points from the encoded start to x*, one for each of the path, (N_POINTS, n)."""
@@ -223,10 +278,10 @@ class Candidate(NamedTuple):
     line: Array
     """(N, n) the latent points"""
 
-    def refined(self, path: Array) -> Candidate:
+    def refined(self, path: Array, steps: int = 300) -> Candidate:
         weights = np.ones(len(path))
         weights[[0, -1]] = 0.05 * len(path)  # the start must encode to the start, the goal to the goal
-        return self._replace(layers=refine(self.layers, self.line, path, 0.95, weights=weights))
+        return self._replace(layers=refine(self.layers, self.line, path, 0.95, weights=weights, steps=steps))
 
     def placed(self, origin: Array, unit: float) -> Candidate:
         """The same match in other units, about another origin."""
@@ -235,7 +290,8 @@ class Candidate(NamedTuple):
         return self._replace(layers=layers, line=origin + unit * self.line)
 
     def mse(self, path: Array) -> float:
-        return float(np.square(apply_layers(self.layers, self.line) - path).mean())
+        line = self.line[:1] + np.linspace(0, 1, len(path))[:, None] * (self.line[-1] - self.line[0])
+        return float(np.square(apply_layers(self.layers, line) - path).mean())
 
 
 def _candidates(path: Array, n_layers: int, homotopy: str) -> Iterator[Candidate]:
@@ -256,6 +312,30 @@ def _candidates(path: Array, n_layers: int, homotopy: str) -> Iterator[Candidate
             curves = curvature_homotopy(path, min(steps, most))
             for width in widths:
                 yield matched("unbending", curves, width)
+
+
+def _deeper(path: Array, dense: Array, homotopy: str) -> Iterator[Candidate]:
+    """Matches for a path that those of ``DEPTHS[0]`` layers do not follow, the quickest first.
+
+    More layers; then homotopies tracked as closely as strands need, on points that are denser where they are close.
+    """
+    yield from _candidates(path, DEPTHS[1], homotopy)
+    steps = np.linalg.norm(np.diff(dense, axis=0), axis=1)
+    length, width = float(steps.sum()), 1.5 * float(np.median(steps))
+
+    def tracked(isotopy: str, curves: Array) -> Iterator[Candidate]:
+        layers = track(curves, DEPTHS[2], width)
+        if layers is not None:
+            yield Candidate(isotopy, layers, curves[0])
+
+    if homotopy != "curvature":
+        direction, clear = clear_direction(path)
+        for share in (1.0, 0.25) if clear > CLEAR else ():
+            yield from tracked("straight", drawn_homotopy(dense, direction, share * length, FINE))
+    if path.shape[1] > 1 and homotopy != "linear":
+        yield from tracked("unbending", curvature_homotopy(dense, FINE))
+        for pivot in (0.5, 0.0, 1.0):
+            yield from tracked("unbending", zoom_homotopy(dense, FINE, pivot))
 
 
 def mean_motion(shown: Sequence[Demonstration]) -> tuple[Demonstration, tuple[float, ...]]:
@@ -288,14 +368,7 @@ def _refuse_crossings(path: Array, origin: Array, unit: float) -> None:
     count = len(step)
     first, second = np.triu_indices(count, max(2, count // 50))
     gap = start[first] - start[second]
-    # the closest points of two segments: clamp one, solve for the other, clamp, solve back
-    a, e = (step[first] ** 2).sum(1), (step[second] ** 2).sum(1)
-    b, c, f = (step[first] * step[second]).sum(1), (step[first] * gap).sum(1), (step[second] * gap).sum(1)
-    denominator = a * e - b * b
-    s = np.clip(np.where(denominator > 1e-12 * a * e, (b * f - c * e) / np.maximum(denominator, 1e-300), 0.0), 0, 1)
-    t = np.clip((b * s + f) / np.maximum(e, 1e-300), 0, 1)
-    s = np.clip((b * t - c) / np.maximum(a, 1e-300), 0, 1)
-    near = np.linalg.norm(gap + s[:, None] * step[first] - t[:, None] * step[second], axis=1)
+    near, t = segment_distances(gap, step[first], step[second])
     worst = int(np.argmin(near))
     if near[worst] < 1e-7 * np.ptp(path, axis=0).max():
         where = f"[{', '.join(f'{value:.4g}' for value in origin + unit * start[first[worst]])}]"
