@@ -24,29 +24,39 @@ def segment_distances(gap: Array, step: Array, other: Array) -> tuple[Array, Arr
     return np.linalg.norm(gap + s[:, None] * step - t[:, None] * other, axis=1), t
 
 
-def clearance(curve: Array, points: int = 150) -> Array:
-    """How far each point of a curve (N, n) is from other strands, at most a tenth of the curve's length: (N,).
+class Strands:
+    """The strands of a curve (N, n) and of those that it comes from, all of as many points.
 
-    Another strand is what lies farther along the curve than half a circle of that diameter. Looked at on a polygon
-    through so many points.
+    Two points are of two strands if one lies farther along a curve than half a circle whose diameter is their distance:
+    along the final curve, or along the one that is looked at. Looked at on polygons through so many points.
     """
-    chosen = np.unique(np.linspace(0, len(curve) - 1, points).round().astype(int))
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
-    corners, along = curve[chosen], arc[chosen]
-    first, second = np.triu_indices(len(corners) - 1, 2)
-    step = np.diff(corners, axis=0)
-    middle = (corners[1:] + corners[:-1]) / 2
-    # a pair is of two strands if its middles are: near the end of one arc segments come as close as one likes
-    span = (along[second + 1] + along[second] - along[first + 1] - along[first]) / 2
-    strands = span > 0.5001 * math.pi * np.linalg.norm(middle[first] - middle[second], axis=1)
-    first, second = first[strands], second[strands]
-    nearest = np.full(len(corners), 0.1 * arc[-1])
-    if len(first):
-        apart = segment_distances(corners[first] - corners[second], step[first], step[second])[0]
-        for ends in (first, first + 1, second, second + 1):
-            np.minimum.at(nearest, ends, apart)
-    found: Array = np.interp(np.arange(len(curve)), chosen, nearest)
-    return found
+
+    def __init__(self, final: Array, points: int = 150) -> None:
+        self.chosen = np.unique(np.linspace(0, len(final) - 1, points).round().astype(int))
+        self.pairs = np.stack(np.triu_indices(len(self.chosen) - 1, 2))
+        self.final = self._apart(final)
+
+    def clearance(self, curve: Array) -> Array:
+        """How far each point is from other strands, at most a tenth of the curve's length: (N, n) -> (N,)."""
+        first, second = self.pairs[:, self.final | self._apart(curve)]
+        corners = curve[self.chosen]
+        step = np.diff(corners, axis=0)
+        nearest = np.full(len(corners), 0.1 * np.linalg.norm(step, axis=1).sum())
+        if len(first):
+            apart = segment_distances(corners[first] - corners[second], step[first], step[second])[0]
+            for ends in (first, first + 1, second, second + 1):
+                np.minimum.at(nearest, ends, apart)
+        found: Array = np.interp(np.arange(len(curve)), self.chosen, nearest)
+        return found
+
+    def _apart(self, curve: Array) -> NDArray[np.bool_]:
+        """Which pairs of segments are of two strands of this curve, by their middles."""
+        arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])[self.chosen]
+        middle, along = (curve[self.chosen][1:] + curve[self.chosen][:-1]) / 2, (arc[1:] + arc[:-1]) / 2
+        first, second = self.pairs
+        squared = sum((column[second] - column[first]) ** 2 for column in middle.T)
+        found: NDArray[np.bool_] = (along[second] - along[first]) ** 2 > (0.5001 * math.pi) ** 2 * squared
+        return found
 
 
 def crowded(curve: Array, most: int) -> Array:
@@ -55,7 +65,7 @@ def crowded(curve: Array, most: int) -> Array:
     Even in arc length but for that; as many as leave half of the clearance between two of them, from 600 on.
     """
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
-    density = np.maximum(600 / arc[-1], 2 / np.maximum(clearance(curve, 600), 1e-12))
+    density = np.maximum(600 / arc[-1], 2 / np.maximum(Strands(curve, 600).clearance(curve), 1e-12))
     count = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(arc))])
     even = np.interp(np.linspace(0, count[-1], min(most, math.ceil(count[-1]) + 1)), count, arc)
     points: Array = np.stack([np.interp(even, arc, column) for column in curve.T], axis=1)

@@ -27,20 +27,22 @@ from ..fitting.homotopy import (
     linear_homotopy,
     zoom_homotopy,
 )
-from ..fitting.matching import apply_layers, match_along, restore_on_failure, track
+from ..fitting.matching import apply_layers, match_along, pin_ends, restore_on_failure, track
 from ..fitting.refinement import refine
-from ..fitting.strands import clearance, crowded, segment_distances
+from ..fitting.strands import Strands, crowded, segment_distances
 from ..metrics import dtw
 from ..time_law import PiecewiseLinearLaw
 
 Array = NDArray[np.float64]
 
-DEPTHS = (300, 1000, 8000)
+DEPTHS = (300, 1000, 12000)
 """Layers where none are asked for: of the first try; of one more; at most of matches that track a homotopy closely."""
 START_MISS = 0.005
 """Largest distance of the motion from the demonstrated start and the path, in its sizes, that a fit is content with."""
 FINE = 500
 """Steps of a homotopy that is tracked; it takes several at once where strands are far apart."""
+TRACKED = (3.0, 1.5)
+"""Least widths of a layer in distances between points that are tried when a homotopy is tracked."""
 CLEAR = 0.02
 """Least share of their distance that strands keep on a linear homotopy worth tracking."""
 MOST_POINTS = 2000
@@ -67,6 +69,8 @@ TRIES, CLOSE = 3, 1.3
 """So many matches are refined if they score within this factor of the best, …"""
 GOOD_SCORE = 0.06
 """… and further ones until one scores less than this, or three times this after so many."""
+HOPELESS = 1.0
+"""Where the best of so many scores more than this, and the depth is not given, more layers are the next to be tried."""
 FAR = 0.25
 """Distance from the axis, in sizes of the motion, beyond which the inward pull stops growing."""
 
@@ -158,7 +162,8 @@ class TubeDS(LatentDS):
                 for tried, (score, candidate) in enumerate(list(judged)):
                     close = tried < TRIES and score < CLOSE * judged[0][0]
                     enough = min(score for score, _ in judged) < GOOD_SCORE * (1 if tried < TRIES else 3)
-                    if tried and enough and not close:
+                    hopeless = self.n_layers is None and tried >= TRIES and min(score for score, _ in judged) > HOPELESS
+                    if tried and (enough or hopeless) and not close:
                         break
                     better = candidate.refined(path)
                     self._take(better, shape, law)
@@ -226,15 +231,13 @@ class TubeDS(LatentDS):
             if again[-1][0] <= 1:
                 break
         else:
-            for bad, candidate in sorted(again, key=lambda pair: pair[0])[: TRIES if self.refined else 0]:
-                better = candidate.refined(dense, 100) if len(candidate.line) == len(dense) else candidate.refined(path)
+            for _, candidate in sorted(again, key=lambda pair: pair[0])[: 1 if self.refined else 0]:
+                better = candidate.refined(dense if len(candidate.line) == len(dense) else path, 100)
                 again.append((badness(better), better))
-                if again[-1][0] <= 1:
-                    break
         best, least = min([(least, best), *again], key=lambda pair: pair[0])[::-1]
         if least <= 1:
             return best, ()
-        near = float(clearance(path, N_POINTS).min())
+        near = float(Strands(path, N_POINTS).clearance(path).min())
         return best, (f"no match tried follows the path closely; its strands come within {near:.2g} of its size",)
 
     def _line(self) -> Tensor:
@@ -321,12 +324,14 @@ def _deeper(path: Array, dense: Array, homotopy: str) -> Iterator[Candidate]:
     """
     yield from _candidates(path, DEPTHS[1], homotopy)
     steps = np.linalg.norm(np.diff(dense, axis=0), axis=1)
-    length, width = float(steps.sum()), 1.5 * float(np.median(steps))
+    length, apart = float(steps.sum()), float(np.median(steps))
 
     def tracked(isotopy: str, curves: Array) -> Iterator[Candidate]:
-        layers = track(curves, DEPTHS[2], width)
-        if layers is not None:
-            yield Candidate(isotopy, layers, curves[0])
+        for width in TRACKED:
+            layers = track(curves, DEPTHS[2], width * apart)
+            if layers is not None:
+                yield Candidate(isotopy, pin_ends(layers, curves[0], dense, 0.9), curves[0])
+                return
 
     if homotopy != "curvature":
         direction, clear = clear_direction(path)
