@@ -53,7 +53,7 @@ class Study:
 
     def setting(self, method: str, shown: Demonstration) -> Setting:
         """The paper's where it prints one, else its rule's with the least β."""
-        return TABLE_ONE[method].get(shown.name) or self.choice(method, shown).least_beta.setting
+        return TABLE_ONE[method].get(shown.name) or tuning.setting(self.choice(method, shown).least_beta)
 
     def protocol(self, *, n_starts: int | None = None, radius: float = 0.1) -> Protocol:
         """The plan's; ``n_starts`` of its own if given."""
@@ -71,8 +71,8 @@ class Study:
                 chosen = self.choice(method, shown)
                 for label, setting in {
                     method: self.setting(method, shown),
-                    f"{method}, least β": chosen.least_beta.setting,
-                    f"{method}, least MSE": chosen.least_mse.setting,
+                    f"{method}, least β": tuning.setting(chosen.least_beta),
+                    f"{method}, least MSE": tuning.setting(chosen.least_mse),
                 }.items():
                     cells.append(Cell(label, greedy(method, setting), shown))
         return self.run(cells, self.protocol())

@@ -19,9 +19,14 @@ from ..dynamics import RayDynamics
 from ..fitting.homotopy import linear_homotopy
 from ..fitting.matching import PINS, match_along, pin_ends, restore_on_failure
 from ..fitting.refinement import refine
+from ..fitting.tuning import BETAS, MUS, tuned
 from ..time_law import TimeLaw
 
 Self = TypeVar("Self", bound="GreedyDS")
+
+
+BETA, MU = 0.5, 0.9
+"""β and μ where neither they nor the paper's rule are asked for."""
 
 
 class GreedyDS(LatentDS):
@@ -31,9 +36,11 @@ class GreedyDS(LatentDS):
 
     Args:
         dim: n >= 1.
-        n_layers: M >= 1. The paper's Table I uses 50 to 750.
-        beta: β in (0, 1], the share of the largest error that a layer moves.
-        mu: μ in (0, 1), how near to its invertibility bound a layer may come.
+        n_layers: M >= 1; None for the paper's own rule: the fewest of 25 to 750 that bring the match's MSE, for a
+            motion of radius 1, below 1e-5 with some β and μ of a grid, or the least MSE if none do; in seconds. The
+            report's notes say which. The paper's Table I uses 50 to 750.
+        beta: β in (0, 1], the share of the largest error that a layer moves; None for 0.5, or the rule's.
+        mu: μ in (0, 1), how near to its invertibility bound a layer may come; None for 0.9, or the rule's.
         steps: continuation steps of the matching; 1 is the paper's.
         refined: whether all layers are moved together by L-BFGS after the greedy match; the paper's are not.
         pinned: whether two more layers bring the ends of the latent line exactly onto start and goal. The paper's are
@@ -47,18 +54,19 @@ class GreedyDS(LatentDS):
         self,
         dim: int,
         *,
-        n_layers: int = 150,
-        beta: float = 0.5,
-        mu: float = 0.9,
+        n_layers: int | None = 150,
+        beta: float | None = None,
+        mu: float | None = None,
         steps: int = 1,
         refined: bool = False,
         pinned: bool = True,
     ) -> None:
-        self.n_layers = whole_number(n_layers, "n_layers", at_least=1)
-        psi = LocallyWeightedTranslations(dim, self.n_layers + PINS * bool(pinned))
+        self.n_layers = None if n_layers is None else whole_number(n_layers, "n_layers", at_least=1)
+        count = None if self.n_layers is None else self.n_layers + PINS * bool(pinned)
+        psi = LocallyWeightedTranslations(dim, count)
         super().__init__(dim, psi, RayDynamics(self.time_law(1.0)))
-        self.beta = number_in(beta, "beta", 0, 1, ends="(]")
-        self.mu = number_in(mu, "mu", 0, 1)
+        self.beta = None if beta is None else number_in(beta, "beta", 0, 1, ends="(]")
+        self.mu = None if mu is None else number_in(mu, "mu", 0, 1)
         self.steps = whole_number(steps, "steps", at_least=1)
         self.refined = bool(refined)
         self.pinned = bool(pinned)
@@ -79,12 +87,12 @@ class GreedyDS(LatentDS):
         psi, points = self.diffeomorphism, shown.positions.numpy()
         latent = self.latent_line(shown)
         with restore_on_failure(self, shown):
-            curves = linear_homotopy(latent, points, self.steps)
-            layers = match_along(curves, psi.n_layers - PINS * self.pinned, self.beta, self.mu)
+            n_layers, beta, mu, notes = self._hyperparameters(latent, points)
+            layers = match_along(linear_homotopy(latent, points, self.steps), n_layers, beta, mu)
             if self.refined:
-                layers = refine(layers, latent, points, self.mu)
+                layers = refine(layers, latent, points, mu)
             if self.pinned:
-                layers = pin_ends(layers, latent, points, self.mu)
+                layers = pin_ends(layers, latent, points, mu)
             psi.assign(*(torch.from_numpy(part) for part in layers))
             self.dynamics.law = self.time_law(shown.duration).to(self.attractor)
             with torch.no_grad():
@@ -92,5 +100,15 @@ class GreedyDS(LatentDS):
                 self.start.copy_(shown.start)
                 missed = psi(torch.from_numpy(latent).to(self.attractor)) - shown.positions.to(self.attractor)
             mse, seconds = float(missed.square().mean()), time.perf_counter() - began
-            self.fit_report = FitReport(mse, psi.n_layers, seconds, learned_from=(shown.fingerprint,))
+            self.fit_report = FitReport(mse, psi.n_layers, seconds, notes=notes, learned_from=(shown.fingerprint,))
         return self
+
+    def _hyperparameters(
+        self, latent: NDArray[np.float64], points: NDArray[np.float64]
+    ) -> tuple[int, float, float, tuple[str, ...]]:
+        """M, β and μ, and a note of those that were not given."""
+        if self.n_layers is not None:
+            return self.n_layers, self.beta or BETA, self.mu or MU, ()
+        found = tuned(latent, points, *((given,) if given else grid for given, grid in ((self.beta, BETAS), (self.mu, MUS))))
+        note = f"chose n_layers {found.n_layers}, beta {found.beta:g} and mu {found.mu:g} by the paper's rule"
+        return found.n_layers, found.beta, found.mu, (note,)
