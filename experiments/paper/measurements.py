@@ -21,6 +21,7 @@ from experiments.published import TABLE_ONE, TABLE_TWO, Size
 from experiments.scores import level, welch
 from latentds import Demonstration, StableDS, datasets, metrics
 from latentds.benchmark import Cell, Outcome
+from latentds.fitting.tuning import choose
 
 Array = NDArray[np.float64]
 
@@ -45,14 +46,14 @@ def tuned(study: Study) -> pd.DataFrame:
     for shown in study.spirals:
         for method in RIVALS:
             grid, more = study.tried(method, shown)
-            choice, paper = tuning.choose(grid), TABLE_ONE[method].get(shown.name)
+            choice, paper = choose(grid), TABLE_ONE[method].get(shown.name)
             lines.append(
                 {
                     "spiral": shown.name,
                     "method": method,
                     "paper": paper,
                     "choice": choice,
-                    "with TPE": tuning.choose([*grid, *more]).least_mse.n_layers,
+                    "with TPE": choose([*grid, *more]).least_mse.n_layers,
                     "fewer": paper and choice.good and choice.least_mse.n_layers <= paper.n_layers,
                 }
             )

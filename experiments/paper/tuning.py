@@ -19,10 +19,11 @@ from experiments.methods import GREEDY
 from experiments.published import Setting
 from latentds import Demonstration
 from latentds.fitting.matching import add_greedy_layers
-from latentds.fitting.tuning import BETAS, DEPTHS, GOOD, MUS, Choice, Tried, choose
+from latentds.fitting.tuning import BETAS, DEPTHS, GOOD, MUS, Tried
 from latentds.store import fingerprint
 
 Array = NDArray[np.float64]
+
 
 class Grid(NamedTuple):
     """What is tried; ``n_more`` trials of Optuna's TPE sampler between the grid's values follow."""

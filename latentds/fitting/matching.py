@@ -65,7 +65,7 @@ def match_along(curves: Array, n_layers: int, beta: float, mu: float, narrowest:
 STRIDE = 0.3
 """Longest step along a homotopy that :func:`track` takes, in clearances of each point."""
 ON_THE_WAY, AT_THE_END = 0.1, 0.02
-"""Distance from a curve of the homotopy, in clearances, at which :func:`track` goes on to a further one; and to stop."""
+"""Distance from a curve of the homotopy, in clearances, at which :func:`track` goes on to a further one, and ends."""
 AT_ONCE = 10
 """Layers that it adds before it looks again."""
 STUCK = 1500

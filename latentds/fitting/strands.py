@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-def segment_distances(gap: Array, step: Array, other: Array) -> tuple[Array, Array]:
-    """Distances of pairs of segments, a + s step and b + t other with s, t in [0, 1] and gap = a - b; and t: (m,) each.
+def segment_distances(gap: Array, step: Array, other: Array) -> Array:
+    """Distances (m,) of segments a + s step and b + t other with s, t in [0, 1] and gap = a - b, all (m, n).
 
-    (m, n) each. Clamp one, solve for the other, clamp, solve back.
+    Clamp one, solve for the other, clamp, solve back.
     """
     a, e = (step**2).sum(1), (other**2).sum(1)
     b, c, f = (step * other).sum(1), (step * gap).sum(1), (other * gap).sum(1)
@@ -21,7 +21,8 @@ def segment_distances(gap: Array, step: Array, other: Array) -> tuple[Array, Arr
     s = np.clip(np.where(denominator > 1e-12 * a * e, (b * f - c * e) / np.maximum(denominator, 1e-300), 0.0), 0, 1)
     t = np.clip((b * s + f) / np.maximum(e, 1e-300), 0, 1)
     s = np.clip((b * t - c) / np.maximum(a, 1e-300), 0, 1)
-    return np.linalg.norm(gap + s[:, None] * step - t[:, None] * other, axis=1), t
+    found: Array = np.linalg.norm(gap + s[:, None] * step - t[:, None] * other, axis=1)
+    return found
 
 
 class Strands:
@@ -43,7 +44,7 @@ class Strands:
         step = np.diff(corners, axis=0)
         nearest = np.full(len(corners), 0.1 * np.linalg.norm(step, axis=1).sum())
         if len(first):
-            apart = segment_distances(corners[first] - corners[second], step[first], step[second])[0]
+            apart = segment_distances(corners[first] - corners[second], step[first], step[second])
             for ends in (first, first + 1, second, second + 1):
                 np.minimum.at(nearest, ends, apart)
         found: Array = np.interp(np.arange(len(curve)), self.chosen, nearest)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -54,15 +54,15 @@ def choose(tried: Sequence[Tried]) -> Choice:
     return Choice(min(equal, key=lambda one: (one.beta, one.mse)), min(equal, key=lambda one: one.mse), True)
 
 
-def tuned(x: Array, y: Array, betas: Iterable[float], mus: Iterable[float]) -> Tried:
-    """The rule's candidate with the least MSE for the match of x to y, (N, n), over the grid and ``DEPTHS``.
+def tuned(x: Array, y: Array) -> Tried:
+    """The rule's candidate with the least MSE for the match of x to y, (N, n), over the grid.
 
     A match goes on where the same with fewer layers ended, so every combination is tried with as many layers as the
     quickest one needs, and with no more.
     """
     chosen = np.unique(np.linspace(0, len(x) - 1, min(len(x), POINTS)).round().astype(int))
     target, unit = y[chosen], (float(np.ptp(y, axis=0).max()) / 2) ** 2
-    moved = {(beta, mu): x[chosen] for beta in betas for mu in mus}
+    moved = {(beta, mu): x[chosen] for beta in BETAS for mu in MUS}
     tried, used = [], 0
     for depth in DEPTHS:
         for beta, mu in moved:

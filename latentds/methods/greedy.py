@@ -19,14 +19,14 @@ from ..dynamics import RayDynamics
 from ..fitting.homotopy import linear_homotopy
 from ..fitting.matching import PINS, match_along, pin_ends, restore_on_failure
 from ..fitting.refinement import refine
-from ..fitting.tuning import BETAS, MUS, tuned
+from ..fitting.tuning import tuned
 from ..time_law import TimeLaw
 
 Self = TypeVar("Self", bound="GreedyDS")
 
 
 BETA, MU = 0.5, 0.9
-"""β and μ where neither they nor the paper's rule are asked for."""
+"""The defaults of β and μ."""
 
 
 class GreedyDS(LatentDS):
@@ -36,11 +36,11 @@ class GreedyDS(LatentDS):
 
     Args:
         dim: n >= 1.
-        n_layers: M >= 1; None for the paper's own rule: the fewest of 25 to 750 that bring the match's MSE, for a
-            motion of radius 1, below 1e-5 with some β and μ of a grid, or the least MSE if none do; in seconds. The
-            report's notes say which. The paper's Table I uses 50 to 750.
-        beta: β in (0, 1], the share of the largest error that a layer moves; None for 0.5, or the rule's.
-        mu: μ in (0, 1), how near to its invertibility bound a layer may come; None for 0.9, or the rule's.
+        n_layers: M >= 1. The paper's Table I uses 50 to 750. None for the paper's own rule, which chooses β and μ too:
+            the fewest of 25 to 750 layers that bring the match's MSE, for a motion of radius 1, below 1e-5 with some
+            β and μ of a grid, or the least MSE if none do; in seconds. The report's notes say which.
+        beta: β in (0, 1], the share of the largest error that a layer moves.
+        mu: μ in (0, 1), how near to its invertibility bound a layer may come.
         steps: continuation steps of the matching; 1 is the paper's.
         refined: whether all layers are moved together by L-BFGS after the greedy match; the paper's are not.
         pinned: whether two more layers bring the ends of the latent line exactly onto start and goal. The paper's are
@@ -55,8 +55,8 @@ class GreedyDS(LatentDS):
         dim: int,
         *,
         n_layers: int | None = 150,
-        beta: float | None = None,
-        mu: float | None = None,
+        beta: float = BETA,
+        mu: float = MU,
         steps: int = 1,
         refined: bool = False,
         pinned: bool = True,
@@ -65,8 +65,12 @@ class GreedyDS(LatentDS):
         count = None if self.n_layers is None else self.n_layers + PINS * bool(pinned)
         psi = LocallyWeightedTranslations(dim, count)
         super().__init__(dim, psi, RayDynamics(self.time_law(1.0)))
-        self.beta = None if beta is None else number_in(beta, "beta", 0, 1, ends="(]")
-        self.mu = None if mu is None else number_in(mu, "mu", 0, 1)
+        self.beta = number_in(beta, "beta", 0, 1, ends="(]")
+        self.mu = number_in(mu, "mu", 0, 1)
+        if n_layers is None and (self.beta, self.mu) != (BETA, MU):
+            raise ValueError(
+                f"n_layers: expected a number beside beta {self.beta:g} and mu {self.mu:g}, got None, which chooses both"
+            )
         self.steps = whole_number(steps, "steps", at_least=1)
         self.refined = bool(refined)
         self.pinned = bool(pinned)
@@ -108,7 +112,7 @@ class GreedyDS(LatentDS):
     ) -> tuple[int, float, float, tuple[str, ...]]:
         """M, β and μ, and a note of those that were not given."""
         if self.n_layers is not None:
-            return self.n_layers, self.beta or BETA, self.mu or MU, ()
-        found = tuned(latent, points, *((given,) if given else grid for given, grid in ((self.beta, BETAS), (self.mu, MUS))))
+            return self.n_layers, self.beta, self.mu, ()
+        found = tuned(latent, points)
         note = f"chose n_layers {found.n_layers}, beta {found.beta:g} and mu {found.mu:g} by the paper's rule"
         return found.n_layers, found.beta, found.mu, (note,)

@@ -45,8 +45,10 @@ TRACKED = (3.0, 1.5)
 """Least widths of a layer in distances between points that are tried when a homotopy is tracked."""
 CLEAR = 0.02
 """Least share of their distance that strands keep on a linear homotopy worth tracking."""
+FINEST = 4800
+"""Points of the path that a fit is held against, and …"""
 MOST_POINTS = 2000
-"""Points, denser where strands are close, that ψ is then matched on."""
+"""… at most so many of them, denser where strands are close, that it is then matched on."""
 N_POINTS = 600
 """Points, even in arc length, that ψ is matched on."""
 LINEAR = ((20, 1.0), (20, 2.0), (20, 4.0), (5, 2.0), (5, 4.0))
@@ -168,7 +170,8 @@ class TubeDS(LatentDS):
                     better = candidate.refined(path)
                     self._take(better, shape, law)
                     judged.append((self._score(shape), better))
-            found, notes = min(judged, key=lambda pair: pair[0])[1], ()
+            found = min(judged, key=lambda pair: pair[0])[1]
+            notes: tuple[str, ...] = ()
             if self.n_layers is None:
                 found, notes = self._followed(found, path, shape, law)
             best = found.placed(origin, unit)
@@ -212,18 +215,18 @@ class TubeDS(LatentDS):
         self, found: Candidate, path: Array, shape: Demonstration, law: PiecewiseLinearLaw
     ) -> tuple[Candidate, tuple[str, ...]]:
         """The match that was found, or a deeper one, the first that follows the path; what stood in the way if none."""
-        even = torch.linspace(0, float(law.time_to_go(torch.ones(()))), ROWS * 8, dtype=torch.float64)
-        share = 1 - law.progress_at(law.time_to_go(torch.ones((), dtype=torch.float64)) - even).clamp(0, 1).numpy()
-        share[-1] = 1
-        timed = np.stack([np.interp(share, np.linspace(0, 1, len(path)), column) for column in path.T], 1)
-        wanted = (Excerpt.of(Demonstration(timed, float(even[1]))),)
+        fine, way, times = arc_length_path(shape.positions.numpy(), shape.times.numpy(), FINEST)
+        even = np.linspace(0, times[-1], 8 * ROWS)
+        share = np.interp(even, times, 1 - way)
+        timed = np.stack([np.interp(share, np.linspace(0, 1, FINEST), column) for column in fine.T], 1)
+        wanted = (Excerpt.of(Demonstration(torch.from_numpy(timed), float(even[1]))),)
 
         def badness(candidate: Candidate) -> float:
             self._take(candidate, shape, law)
             told = measure(self, wanted)
             return max(told.miss / START_MISS, *(bad for bad, _ in told.findings))
 
-        best, least, dense = found, badness(found), crowded(path, MOST_POINTS)
+        best, least, dense = found, badness(found), crowded(fine, MOST_POINTS)
         tried = [] if least <= 1 else _deeper(path, dense, self.homotopy)
         again: list[tuple[float, Candidate]] = []
         for candidate in tried:
@@ -373,7 +376,7 @@ def _refuse_crossings(path: Array, origin: Array, unit: float) -> None:
     count = len(step)
     first, second = np.triu_indices(count, max(2, count // 50))
     gap = start[first] - start[second]
-    near, t = segment_distances(gap, step[first], step[second])
+    near = segment_distances(gap, step[first], step[second])
     worst = int(np.argmin(near))
     if near[worst] < 1e-7 * np.ptp(path, axis=0).max():
         where = f"[{', '.join(f'{value:.4g}' for value in origin + unit * start[first[worst]])}]"
