@@ -322,7 +322,7 @@ def _train_tuned(
 
 
 def _tuned_loss(learner: SDSEF, data: _Normalized) -> Callable[[Tensor], Tensor]:
-    """2 mean(√(1 + ‖v̂-v‖²/‖v‖²) - 1) + mean(√(1 + ‖J_φ⁻¹ d / .05‖²) - 1) + mean ‖z/‖z‖ - e‖².
+    """2 mean(√(1 + ‖v̂-v‖²/‖v‖²) - 1) + mean(√(1 + ‖J_φ⁻¹ d / 0.05‖²) - 1) + mean ‖z/‖z‖ - e‖².
 
     e is the direction of z at the demonstrated start and d = z - max(0, z·e) e the way off the ray along it. The goals
     themselves have no direction and are left out.

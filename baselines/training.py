@@ -70,7 +70,7 @@ def descend(
     """Minimise the mean of ``loss`` over samples; the parameters are left as they entered the best epoch.
 
     A gradient that is not finite, or a diverged batch, brings back the best parameters and continues from there with a
-    fresh Adam and .6 of the rate.
+    fresh Adam and 0.6 of the rate.
 
     Args:
         loss: (b,) sample indices -> (), the mean loss over them.

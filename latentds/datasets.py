@@ -33,7 +33,7 @@ STROKES = {
 def unstable_spiral(c: float, n_points: int = 1000) -> Demonstration:
     """Spiral on the unit sphere, (sin t cos ct, sin t sin ct, cos t), t in [0, 3.14] (paper, App. E).
 
-    It ends .0016 from the pole at full speed: no stable system made it, hence the name.
+    It ends 0.0016 from the pole at full speed: no stable system made it, hence the name.
 
     Args:
         c: complexity, the number of half turns, > 0; the paper uses 1, 3, 7, 10, 15.
@@ -46,9 +46,9 @@ def unstable_spiral(c: float, n_points: int = 1000) -> Demonstration:
 
 
 def stable_spiral(c: float, n_points: int = 1000, *, slowest: float = 1e-2) -> Demonstration:
-    """Spiral on the unit sphere whose angles decay to the goal (paper, App. E): θ' = .3(π-θ), ψ' = .3(2cπ-ψ).
+    """Spiral on the unit sphere whose angles decay to the goal (paper, App. E): θ' = 0.3(π-θ), ψ' = 0.3(2cπ-ψ).
 
-    Euler steps of .003 s from θ = ψ = 0. The paper stops when "the distance between subsequent points" falls below
+    Euler steps of 0.003 s from θ = ψ = 0. The paper stops when "the distance between subsequent points" falls below
     1e-2, which is true at the first step for every c; we stop when the *speed* falls below 1e-2 (after about 15 s) and
     resample evenly in time.
 
@@ -62,7 +62,7 @@ def stable_spiral(c: float, n_points: int = 1000, *, slowest: float = 1e-2) -> D
     count = whole_number(n_points, "n_points", at_least=3)
     step = 0.003
     decay = 1 - 0.3 * step
-    # Euler on θ' = .3(π-θ) is geometric; the speed falls below 1e-2 within 60 s for any c below 1e5.
+    # Euler on θ' = 0.3(π-θ) is geometric; the speed falls below 1e-2 within 60 s for any c below 1e5.
     left = decay ** np.arange(int(60 / step))
     theta, psi = math.pi * (1 - left), 2 * c * math.pi * (1 - left)
     path = np.stack([np.sin(theta) * np.cos(psi), np.sin(theta) * np.sin(psi), np.cos(theta)], axis=1)
@@ -76,7 +76,7 @@ def stable_spiral(c: float, n_points: int = 1000, *, slowest: float = 1e-2) -> D
 
 
 def archimedean_spiral(n_points: int = 1000) -> Demonstration:
-    """Planar Archimedean spiral of radius .1 m, one and a half turns in 12 s, inward to its centre (paper, App. E)."""
+    """Planar Archimedean spiral of radius 0.1 m, one and a half turns in 12 s, inward to its centre (paper, App. E)."""
     count = whole_number(n_points, "n_points", at_least=3)
     outward = np.linspace(1, 0, count)
     angle = 3 * math.pi * outward

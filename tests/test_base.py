@@ -4,30 +4,18 @@ from __future__ import annotations
 
 import copy
 import pickle
-from dataclasses import replace
 
 import pytest
 import torch
 
-import baselines.sdsef
 from baselines import FDM, SDSEF
-from latentds import ChebyshevDS, TubeDS
 from latentds.kernels.dispatch import reference
 from latentds.testing import wavy_motion
 
-METHODS = {
-    "ChebyshevDS": lambda dim: ChebyshevDS(dim, n_layers=20),
-    "FDM": lambda dim: FDM(dim, n_layers=20),
-    "SDSEF": lambda dim: SDSEF(dim, n_layers=4, n_features=20, seed=0),
-    "TubeDS": lambda dim: TubeDS(dim, n_layers=12, refined=False),
-}
 
-
-@pytest.fixture(params=METHODS)
-def ds(request, monkeypatch):
-    plan = baselines.sdsef.PLANS["tuned"]
-    monkeypatch.setitem(baselines.sdsef.PLANS, "tuned", replace(plan, epochs=25))
-    return METHODS[request.param](2).fit(wavy_motion(2))
+@pytest.fixture
+def ds(fitted, method):
+    return fitted(method, 2)
 
 
 @torch.no_grad()

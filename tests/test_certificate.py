@@ -10,31 +10,16 @@ import numpy as np
 import pytest
 import torch
 
-import baselines.sdsef
-from baselines import FDM, SDSEF
-from latentds import ChebyshevDS, LatentDS, LocallyWeightedTranslations, StableDS, TubeDS, certify
+from baselines import SDSEF
+from latentds import LatentDS, LocallyWeightedTranslations, StableDS, TubeDS, certify
 from latentds.dynamics import RayDynamics
 from latentds.testing import wavy_motion
 from latentds.time_law import PiecewiseLinearLaw
 
-METHODS = {
-    "ChebyshevDS": lambda dim: ChebyshevDS(dim, n_layers=60),
-    "FDM": lambda dim: FDM(dim, n_layers=60),
-    "TubeDS": lambda dim: TubeDS(dim, n_layers=60, refined=False),
-    "SDSEF": lambda dim: SDSEF(dim, n_layers=4, n_features=30, seed=0),
-}
-
-
-@pytest.fixture(autouse=True)
-def _short_training(monkeypatch):
-    plan = baselines.sdsef.PLANS["tuned"]
-    monkeypatch.setitem(baselines.sdsef.PLANS, "tuned", dataclasses.replace(plan, epochs=50))
-
 
 @pytest.mark.parametrize("dim", [1, 2, 7])
-@pytest.mark.parametrize("method", METHODS)
-def test_sound_methods_are_not_falsified(method, dim):
-    ds = METHODS[method](dim).fit(wavy_motion(dim))
+def test_sound_methods_are_not_falsified(fitted, method, dim):
+    ds = fitted(method, dim)
     certificate = certify(ds, n_samples=200)
     said = ds.fit_report.fidelity.notes and method == "SDSEF"  # 50 epochs are few
     assert [line.claim for line in certificate.falsified] == ["follows its demonstration"] * bool(said), str(
@@ -67,7 +52,7 @@ class FlipsTheSign(Sound):
 
 
 class FlipsTheSignSomewhere(Sound):
-    """Only within .15 of a place that few samples hit; ascent on V̇/V finds the rim."""
+    """Only within 0.15 of a place that few samples hit; ascent on V̇/V finds the rim."""
 
     place = (-0.4, 0.3)
 
@@ -308,9 +293,9 @@ def test_an_attractive_but_unstable_system_is_falsified(energy):
 @pytest.mark.parametrize("corner", [0.0, 1.0])
 @pytest.mark.parametrize("method", ["ChebyshevDS", "FDM", "TubeDS"])
 @pytest.mark.parametrize("dim", [2, 7])
-def test_the_rate_that_is_proven_holds_in_all_of_the_region(method, dim, corner):
+def test_the_rate_that_is_proven_holds_in_all_of_the_region(fitted, method, dim, corner):
     """At its corners, too, where samples hardly come; the oracle is ẋ itself."""
-    ds = METHODS[method](dim).fit(wavy_motion(dim))
+    ds = fitted(method, dim)
     certificate = certify(ds, n_samples=20)
     low, high = torch.tensor(certificate.region, dtype=torch.float64)
     share = torch.rand(4000, dim, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
@@ -365,31 +350,31 @@ NUMBERS = {
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-def test_numbers_that_make_no_system_are_not_believed(name):
+def test_numbers_that_make_no_system_are_not_believed(fitted, name):
     """As a file, a hand or an optimiser may leave them behind the constructors' backs."""
     path, factors = NUMBERS[name]
     for factor in factors:
-        ds = TubeDS(2, n_layers=20, refined=False).fit(wavy_motion(2))
+        ds = fitted("TubeDS", 2)
         with torch.no_grad():
             ds.state_dict()[path].mul_(factor)
         lines = certify(ds, [[-2, -2], [2, 2]], n_samples=20).lines
         assert [line.verdict for line in lines if "latent motions" in line.claim] != ["proven"], factor
-    ds = ChebyshevDS(2, n_layers=20).fit(wavy_motion(2))
+    ds = fitted("ChebyshevDS", 2)
     ds.dynamics.law.omega.neg_()
     assert not certify(ds, n_samples=20).holds
 
 
-def test_a_region_that_nothing_spans_is_asked_for():
-    ds = ChebyshevDS(2, n_layers=20).fit(wavy_motion(2))
+def test_a_region_that_nothing_spans_is_asked_for(fitted):
+    ds = fitted("ChebyshevDS", 2)
     ds.start.fill_(math.nan)
     with pytest.raises(ValueError, match=r"region: expected .* corners, as a latent length of nan implies none"):
         certify(ds)
     assert not certify(ds, [[-2, -2], [2, 2]], n_samples=20).holds
 
 
-def test_demonstrations_of_another_dimension_are_refused():
-    ds = ChebyshevDS(2, n_layers=20).fit(wavy_motion(2))
-    ds.fit_report = ChebyshevDS(3, n_layers=20).fit(wavy_motion(3)).fit_report
+def test_demonstrations_of_another_dimension_are_refused(fitted):
+    ds = fitted("ChebyshevDS", 2)
+    ds.fit_report = fitted("ChebyshevDS", 3).fit_report
     with pytest.raises(ValueError, match="ds: expected a fit_report that keeps demonstrations of dimension 2"):
         certify(ds)
 
@@ -425,8 +410,8 @@ def test_reading_and_json():
         certificate.seed = 3
 
 
-def test_same_seed_same_certificate_and_nothing_changes():
-    ds = TubeDS(3, n_layers=30, refined=False).fit(wavy_motion(3))
+def test_same_seed_same_certificate_and_nothing_changes(fitted):
+    ds = fitted("TubeDS", 3)
     state = {name: value.clone() for name, value in ds.state_dict().items()}
     before = torch.get_rng_state()
     assert certify(ds, n_samples=50, seed=4) == certify(ds, n_samples=50, seed=4)
@@ -436,8 +421,8 @@ def test_same_seed_same_certificate_and_nothing_changes():
     assert all(parameter.grad is None for parameter in ds.parameters())
 
 
-def test_float32_is_judged_by_its_own_rounding():
-    ds = FDM(3, n_layers=30).fit(wavy_motion(3)).to(torch.float32)
+def test_float32_is_judged_by_its_own_rounding(fitted):
+    ds = fitted("FDM", 3).to(torch.float32)
     assert certify(ds, n_samples=50).holds
 
 

@@ -38,11 +38,11 @@ def test_stable_spiral(c):
     )  # fmt: skip
     theta, psi = solved.y
     exact = np.stack([np.sin(theta) * np.cos(psi), np.sin(theta) * np.sin(psi), np.cos(theta)], axis=1)
-    assert np.abs(shown.positions.numpy() - exact).max() < 5e-3 * c  # Euler's error at .003 s
+    assert np.abs(shown.positions.numpy() - exact).max() < 5e-3 * c  # Euler's error at 0.003 s
 
 
 def test_paper_stop_rule_would_stop_at_once():
-    """Steps of .003 s are shorter than 1e-2 from the first on, for every complexity: the rule cannot be meant."""
+    """Steps of 0.003 s are shorter than 1e-2 from the first on, for every complexity: the rule cannot be meant."""
     for c in datasets.STABLE_COMPLEXITIES:
         fastest = 0.3 * math.hypot(math.pi, 2 * c * math.pi)
         step = datasets.stable_spiral(c, 5000).positions[:2].diff(dim=0).norm().item()

@@ -15,7 +15,7 @@ from latentds.diffeomorphism import WIDTH_BOUND
 
 
 def random_psi(dim, n_layers=12, strength=1.0, seed=3):
-    """``strength`` is ‖a‖'s scale: 1 asks for about .7 of the invertibility bound, 10 for .995."""
+    """``strength`` is ‖a‖'s scale: 1 asks for about 0.7 of the invertibility bound, 10 for 0.995."""
     draw = torch.Generator().manual_seed(seed)
     psi = LocallyWeightedTranslations(dim, n_layers)
     with torch.no_grad():

@@ -104,7 +104,9 @@ def plain_dtw(path: np.ndarray, reference: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("curve", HARD)
+@pytest.mark.parametrize(
+    "curve", [pytest.param(curve, marks=[pytest.mark.slow] * (curve not in ("loop", "trefoil"))) for curve in HARD]
+)
 def test_no_misfit_is_silent(curve, method):
     motion = HARD[curve]
     with warnings.catch_warnings(record=True) as caught:

@@ -102,17 +102,9 @@ def test_the_fuzzer_tells_a_broken_promise(monkeypatch):
         assert "1  BROKEN" in summary([(PLAIN, found, 0.1)])
 
 
-@pytest.fixture(scope="module", params=["ChebyshevDS", "FDM", "TubeDS", "SDSEF"])
-def ds(request):
-    """Fitted, but SDS-EF, whose couplings are shaken instead: training takes long and changes nothing here."""
-    shown = datasets.unstable_spiral(1, 200)
-    if request.param != "SDSEF":
-        return METHODS[request.param](3).fit(shown)
-    system = SDSEF(3, n_layers=4, n_features=20, seed=0)
-    with torch.no_grad():
-        for parameter in system.diffeomorphism.parameters():
-            parameter.normal_(0, 0.02, generator=torch.Generator().manual_seed(0))
-    return system
+@pytest.fixture
+def ds(fitted, method):
+    return fitted(method, 3)
 
 
 def calls(ds):

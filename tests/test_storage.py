@@ -24,13 +24,6 @@ from latentds.files import read_tensors, write_tensors
 from latentds.methods.tube import TubeReport
 from latentds.testing import wavy_motion
 
-SYSTEMS = {
-    "ChebyshevDS": lambda: ChebyshevDS(3, n_layers=40, beta=0.7, mu=0.8),
-    "FDM": lambda: FDM(3, n_layers=40),
-    "TubeDS": lambda: TubeDS(3, n_layers=40, contraction=7.0, refined=False),
-    "SDSEF": lambda: SDSEF(3, n_layers=3, n_features=7, recipe="official"),
-}
-
 
 def same(a, b):
     y, times = wavy_motion(3).positions, torch.linspace(0, 1, 3)
@@ -38,15 +31,9 @@ def same(a, b):
         return torch.equal(a(y), b(y)) and torch.equal(a.rollout(y[:2], times), b.rollout(y[:2], times))
 
 
-@pytest.fixture(params=SYSTEMS, ids=lambda name: name)
-def fitted(request):
-    ds = SYSTEMS[request.param]()
-    return ds if isinstance(ds, SDSEF) else ds.fit(datasets.unstable_spiral(3, 200))
-
-
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_gives_the_system_back(fitted, tmp_path, dtype):
-    ds = fitted.to(dtype)
+def test_gives_the_system_back(fitted, method, tmp_path, dtype):
+    ds = fitted(method, 3).to(dtype)
     ds.save(tmp_path / "ds.safetensors")
     back = latentds.load(tmp_path / "ds.safetensors", classes=[FDM, SDSEF])
     assert type(back) is type(ds)
@@ -56,11 +43,12 @@ def test_gives_the_system_back(fitted, tmp_path, dtype):
     assert os.listdir(tmp_path) == ["ds.safetensors"]
 
 
-def test_keeps_the_report_and_what_it_was_learned_from(fitted, tmp_path):
-    fitted.save(tmp_path / "a")
+def test_keeps_the_report_and_what_it_was_learned_from(fitted, method, tmp_path):
+    ds = fitted(method, 3)
+    ds.save(tmp_path / "a")
     report = latentds.load(tmp_path / "a", classes=[FDM, SDSEF]).fit_report
-    assert type(report) is type(fitted.fit_report)
-    assert report == fitted.fit_report
+    assert type(report) is type(ds.fit_report)
+    assert report == ds.fit_report
 
 
 def test_the_report_names_its_demonstrations(tmp_path):

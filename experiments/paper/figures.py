@@ -143,7 +143,7 @@ def p_values(tests: pd.DataFrame) -> Figure:
         axes.bar(i, max(row["p"], floor), 0.6, color=color_of(row["lower"]))
     axes.set_yscale("log")
     axes.axhline(0.05, color=SHOWN, ls="--", lw=1)
-    axes.text(len(tests) - 0.5, 0.05, "p = .05", va="bottom", ha="right", fontsize=8)
+    axes.text(len(tests) - 0.5, 0.05, "p = 0.05", va="bottom", ha="right", fontsize=8)
     for method in dict.fromkeys(tests["lower"]):
         axes.bar(np.nan, np.nan, color=color_of(method), label=f"{method} nearer")
     axes.set_xticks(range(len(tests)), list(tests["spiral"]), rotation=20, ha="right")

@@ -183,7 +183,7 @@ def similarity(study: Study, found: Document) -> None:
     fast, exact = study.scores("dtw_fast"), study.scores("dtw")
     lines = measurements.similarity(fast, exact)
     found.add(
-        "From 20 starts, uniform in a ball of radius .1 around the demonstrated one, the same for every method; 500 "
+        "From 20 starts, uniform in a ball of radius 0.1 around the demonstrated one, the same for every method; 500 "
         "points over the demonstration's duration. Chebyshev and FDM have the paper's hyperparameters where it prints "
         "them, else its rule's with the least β. SDS-EF official: its authors' recipe; SDS-EF: our tuned one. "
         '*Normalised* we read as the caption\'s "case-wise": all scores of a spiral divided by the largest of its '

@@ -81,7 +81,7 @@ def similarity(lines: pd.DataFrame) -> list[Finding]:
         Finding(
             "Chebyshev nearer than FDM (FastDTW)",
             "on par or better",
-            f"nearer on {nearer} of {len(lines)} spirals, with p < .05 on {sure}",
+            f"nearer on {nearer} of {len(lines)} spirals, with p < 0.05 on {sure}",
             REPRODUCED if nearer >= 0.7 * len(lines) else CONTRADICTED if nearer <= 0.3 * len(lines) else IN_PART,
         ),
         Finding(

@@ -72,7 +72,7 @@ def _angles(n_points: int, dim: int) -> Array:
 def arc_length_path(positions: Array, times: Array, n_points: int) -> tuple[Array, Array, Array]:
     """The path evenly spaced in arc length, and when the motion was where along it.
 
-    Points nearer to the last kept one than the recording's noise (read off its second differences, between .05 % and
+    Points nearer to the last kept one than the recording's noise (read off its second differences, between 0.05 % and
     1 % of the motion's size) are dropped: at rest, jitter would pile up as path. A rest at the goal is cut off; other
     rests stay as time spent between two points.
 

@@ -119,7 +119,7 @@ def test_the_summary_counts_what_the_lines_say():
     lines = pd.DataFrame({"spiral": names, "nearer": [True, True, True, False], "lower": [*["Chebyshev"] * 3, "FDM"]})
     lines = lines.assign(fast=[0.04, 0.06, 0.01, 0.01], best=["SDS-EF", "FDM", "Chebyshev", "FDM"])
     nearer, best = verdicts.similarity(lines)
-    assert nearer[2:] == ("nearer on 3 of 4 spirals, with p < .05 on 2", "reproduced")
+    assert nearer[2:] == ("nearer on 3 of 4 spirals, with p < 0.05 on 2", "reproduced")
     assert best[2].startswith("SDS-EF (either recipe) first on 1 of 1 with c ≤ 2, Chebyshev on 1 of 2")
     assert best.verdict == "reproduced in part"
     layers = pd.DataFrame(

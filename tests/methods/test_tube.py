@@ -223,7 +223,7 @@ def test_a_path_that_meets_itself_is_refused(positions):
 
 
 def test_a_path_that_passes_itself_at_a_distance_is_learned():
-    """The same crossing, its strands .4 apart in the third dimension."""
+    """The same crossing, its strands 0.4 apart in the third dimension."""
     flat = figure_of_alpha()
     shown = Demonstration(np.column_stack([flat, np.linspace(0, 0.6, len(flat))]), 0.01)
     ds = fast(3, n_layers=100).fit(shown)
