@@ -72,9 +72,9 @@ def _paths(draw: np.random.Generator) -> Iterator[tuple[str, Array]]:
         yield f"eight in space, gap {gap:g}", _columns(np.sin(angle), np.sin(2 * angle) / 2, gap * t)
     angle = 2 * np.pi * 0.97 * t + 0.1
     yield "eight in space, gap 1e-3, from the far end", _columns(np.cos(angle), np.sin(2 * angle), 1e-3 * np.sin(angle))
-    for turns, height in ((5, 1.0), (10, 2.0), (20, 2.0), (30, 2.0), (30, 6.0)):
+    for turns, height in ((5.0, 1.0), (10.0, 2.0), (20.0, 2.0), (30.0, 2.0), (30.0, 6.0)):
         angle = 2 * np.pi * turns * t
-        yield f"helix, {turns} turns, {height:g} high", _columns(np.cos(angle), np.sin(angle), height * t)
+        yield f"helix, {turns:g} turns, {height:g} high", _columns(np.cos(angle), np.sin(angle), height * t)
     for gap in (1e-1, 1e-2, 1e-3):
         angle = 2 * np.pi * (1 - gap) * t
         yield f"circle open by {gap:g}", _columns(np.cos(angle), np.sin(angle))
@@ -84,7 +84,7 @@ def _paths(draw: np.random.Generator) -> Iterator[tuple[str, Array]]:
         bend = np.interp(t, [0, 0.45, 0.55, 1], [0, 0, np.pi, np.pi])
         hook = np.cumsum(_columns(np.cos(bend), np.sin(bend)), axis=0)
         yield f"hook, {back:g} of the way back", hook[: int(len(t) * (0.55 + 0.45 * back))]
-    for turns in (1.5, 3, 5):
+    for turns in (1.5, 3.0, 5.0):
         for inward in (True, False):
             radius, angle = 0.05 + 0.95 * t, 2 * np.pi * turns * t
             spiral = _columns(radius * np.cos(angle), radius * np.sin(angle))

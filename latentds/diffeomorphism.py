@@ -107,7 +107,8 @@ class LocallyWeightedTranslations(Diffeomorphism):
 
     Args:
         dim: n >= 1.
-        n_layers: M >= 1; None for as many as are assigned or loaded, one until then.
+        n_layers: M >= 1.
+        any_number: whether as many as are assigned or loaded replace them.
 
     Attributes:
         centers: c, (M, n) parameter.
@@ -115,11 +116,11 @@ class LocallyWeightedTranslations(Diffeomorphism):
         strengths: a, (M, n) parameter.
     """
 
-    def __init__(self, dim: int, n_layers: int | None) -> None:
+    def __init__(self, dim: int, n_layers: int, *, any_number: bool = False) -> None:
         super().__init__()
         self.dim = whole_number(dim, "dim", at_least=1)
-        self.any_number = n_layers is None
-        count = 1 if n_layers is None else whole_number(n_layers, "n_layers", at_least=1)
+        self.any_number = any_number
+        count = whole_number(n_layers, "n_layers", at_least=1)
         self.centers = nn.Parameter(torch.zeros(count, dim, dtype=torch.float64))
         self.log_widths = nn.Parameter(torch.zeros(count, dtype=torch.float64))
         self.strengths = nn.Parameter(torch.zeros(count, dim, dtype=torch.float64))

@@ -62,14 +62,14 @@ class GreedyDS(LatentDS):
         pinned: bool = True,
     ) -> None:
         self.n_layers = None if n_layers is None else whole_number(n_layers, "n_layers", at_least=1)
-        count = None if self.n_layers is None else self.n_layers + PINS * bool(pinned)
-        psi = LocallyWeightedTranslations(dim, count)
+        count = (self.n_layers or 1) + PINS * bool(pinned)
+        psi = LocallyWeightedTranslations(dim, count, any_number=n_layers is None)
         super().__init__(dim, psi, RayDynamics(self.time_law(1.0)))
         self.beta = number_in(beta, "beta", 0, 1, ends="(]")
         self.mu = number_in(mu, "mu", 0, 1)
         if n_layers is None and (self.beta, self.mu) != (BETA, MU):
             raise ValueError(
-                f"n_layers: expected a number beside beta {self.beta:g} and mu {self.mu:g}, got None, which chooses both"
+                f"n_layers: expected a number beside beta {self.beta:g} and mu {self.mu:g}, got None: it chooses both"
             )
         self.steps = whole_number(steps, "steps", at_least=1)
         self.refined = bool(refined)

@@ -135,8 +135,9 @@ class TubeDS(LatentDS):
         homotopy: str = "both",
     ) -> None:
         along, across = PiecewiseLinearLaw.uniform(), PiecewiseLinearLaw(torch.ones(1), torch.ones(1))
-        super().__init__(dim, LocallyWeightedTranslations(dim, n_layers), TubeDynamics(along, across))
-        self.n_layers = n_layers
+        psi = LocallyWeightedTranslations(dim, 1 if n_layers is None else n_layers, any_number=n_layers is None)
+        super().__init__(dim, psi, TubeDynamics(along, across))
+        self.n_layers = None if n_layers is None else psi.n_layers
         self.contraction = number_in(contraction, "contraction", 0, float("inf"))
         self.refined = bool(refined)
         known = ("linear", "curvature", "both") if self.dim > 1 else ("linear", "both")
