@@ -32,10 +32,10 @@ from torch import Tensor, nn
 from baselines import SDSEF
 from experiments import figures, goals, loops, report
 from experiments.goals import Goal
-from latentds import ChebyshevDS, datasets, kernels
+from latentds import ChebyshevDS, TubeDS, datasets, kernels
 from latentds.fitting.matching import match
 from latentds.kernels.compiling import OPTIONS
-from latentds.kernels.dispatch import BLOCK
+from latentds.kernels.dispatch import BLOCK, reference
 from latentds.kernels.lanes import WIDTH, exp, load, store
 
 Array = NDArray[np.float64]
@@ -203,6 +203,31 @@ def rollouts(ds: ChebyshevDS, rounds: int) -> list[Goal]:
     ]
 
 
+def gradients(rounds: int) -> list[Goal]:
+    """Of two training steps' losses: by the adjoint kernels, and by autograd through torch's own operations."""
+    ds = TubeDS(3, n_layers=300, refined=False).fit(SHOWN)
+    losses = {
+        "rollout loss": lambda: (ds.rollout(SHOWN.start, SHOWN.times) - SHOWN.positions).square().mean(),
+        "velocity loss": lambda: (ds(SHOWN.positions) - SHOWN.velocities).square().mean(),
+    }
+
+    def gradient(loss: Callable[[], Tensor]) -> Tensor:
+        with torch.enable_grad():
+            return torch.cat([g.flatten() for g in torch.autograd.grad(loss(), list(ds.parameters()))])
+
+    def by_torch(loss: Callable[[], Tensor]) -> Tensor:
+        with reference():
+            return gradient(loss)
+
+    found = []
+    for name, loss in losses.items():
+        fast, slow = partial(gradient, loss), partial(by_torch, loss)
+        apart = float((fast() - slow()).norm() / slow().norm())
+        goal = race(f"gradient of the {name}, M = 300, N = 1000, torch path", 10, slow, fast, few(rounds))
+        found += [goal, goals.at_most("... relative difference", pd.Series([apart]), 1e-10)]
+    return found
+
+
 def fits(rounds: int) -> list[Goal]:
     x, y = ChebyshevDS.latent_line(SHOWN), SHOWN.positions.numpy()
     fast, slow = partial(match, x, y, 300, 0.5, 0.9), partial(loops.match, x, y, 300, 0.5, 0.9)
@@ -305,6 +330,7 @@ def main(
         *against_loop(ds, rounds),
         *control_loop(2000 if quick else 20_000),
         *rollouts(ds, rounds),
+        *gradients(rounds),
         *fits(rounds),
         *sdsef_step(rounds),
     ]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from ..diffeomorphism import WIDTH_BOUND, Layers, directions_of, strengths_of
-from ..kernels.adjoint import chain, chain_adjoint
+from ..kernels.translations import forward_and_adjoint
 
 Array = NDArray[np.float64]
 
@@ -28,11 +28,10 @@ def refine(layers: Layers, x: Array, y: Array, mu: float, *, weights: Array | No
     if not len(layers.widths):
         return layers
     shape = layers.centers.shape
-    points, targets = np.ascontiguousarray(x.T), np.ascontiguousarray(y.T)
+    points, targets = np.ascontiguousarray(x), np.ascontiguousarray(y)
     share = np.ones(len(x)) if weights is None else np.asarray(weights, dtype=np.float64)
-    share = share / (share.sum() * shape[1])
-    unit = float(np.abs(targets - targets.mean(1, keepdims=True)).max())
-    states, kernels = np.empty((shape[0], *points.shape)), np.empty((shape[0], points.shape[1]))
+    share = (share / (share.sum() * shape[1]))[:, None]
+    unit = float(np.abs(targets - targets.mean(0)).max())
 
     def unpack(flat: Array) -> tuple[Array, Array, Array, Array, Array]:
         centers, free = flat[: -shape[0]].reshape(2, *shape)
@@ -43,12 +42,13 @@ def refine(layers: Layers, x: Array, y: Array, mu: float, *, weights: Array | No
     def loss(flat: Array) -> tuple[float, Array]:
         centers, free, root, widths, directions = unpack(flat)
         squares = widths**2
-        missed = chain(points, centers, directions, squares, states, kernels) - targets
-        cotangent = 2 * share * missed
-        d_centers, d_directions, d_squares = chain_adjoint(cotangent, centers, directions, squares, states, kernels)
+        layers = np.column_stack([centers, directions, squares, squares * (directions**2).sum(1)])
+        moved, adjoint = forward_and_adjoint(layers, points)
+        missed = moved - targets
+        d_centers, d_directions, d_squares = np.split(adjoint(2 * share * missed), [shape[1], 2 * shape[1]], axis=1)
         d_bounded = mu * WIDTH_BOUND * d_directions / widths[:, None]
         d_free = d_bounded / root - free * ((d_bounded * free).sum(1, keepdims=True) / root**3)
-        d_logs = 2 * squares * d_squares - (d_directions * directions).sum(1)
+        d_logs = 2 * squares * d_squares[:, 0] - (d_directions * directions).sum(1)
         gradient = np.concatenate([d_centers.ravel() * unit, d_free.ravel(), d_logs])
         return scale * float((share * missed**2).sum()), scale * gradient
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from .adjoint import forward_adjoint, inverse_adjoint
 from .dispatch import BLOCK
 from .greedy import greedy_kernel
 from .translations import forward_kernel, inverse_kernel, pack_kernel
@@ -17,6 +18,9 @@ def warmup(dims: Sequence[int] = (2, 3)) -> None:
             inverse_kernel(dim, block)
             for tangents in {0, 1, dim}:
                 forward_kernel(dim, tangents, block)
+        for tangents in (0, 1):
+            forward_adjoint(dim, tangents)
+        inverse_adjoint(dim)
         velocity_kernel(dim)
     pack_kernel()
     greedy_kernel()

@@ -1,61 +1,186 @@
-"""A chain of locally weighted translations and its adjoint sweep: the gradients that refinement descends on."""
+"""Adjoint sweeps through locally weighted translations: the gradients that training and refinement descend on."""
 
 from __future__ import annotations
 
+from functools import cache
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
-from .compiling import cached
+from .compiling import compiled
+from .lanes import WIDTH, anywhere, exp, load, store, where
 
-_fast = cached(nogil=True, fastmath={"reassoc", "contract", "arcp", "nsz"})
+Array = NDArray[np.float64]
 
+NEGLIGIBLE = 60.0
+"""ρ²‖x-c‖² from which a layer moves a point by less than exp(-60) = 9e-27 of its translation: it is skipped."""
 
-@_fast
-def chain(points, centers, directions, squares, states, kernels):  # type: ignore[no-untyped-def]
-    """ψ of (n, N) points, keeping each layer's input and exp(-ρ²‖x-c‖²) for the way back."""
-    x = points.copy()
-    distance = np.empty(x.shape[1])
-    for j in range(centers.shape[0]):
-        distance[:] = 0.0
-        for a in range(x.shape[0]):
-            for i in range(x.shape[1]):
-                states[j, a, i] = x[a, i]
-                offset = x[a, i] - centers[j, a]
-                distance[i] += offset * offset
-        for i in range(x.shape[1]):
-            exponent = squares[j] * distance[i]
-            kernels[j, i] = np.exp(-exponent) if exponent < 650.0 else 0.0
-        for a in range(x.shape[0]):
-            for i in range(x.shape[1]):
-                x[a, i] += kernels[j, i] * directions[j, a]
-    return x
+ROWS = 32
+"""Points that go through the layers together: what a layer has to keep of them on the way there fits the L2 cache."""
 
 
-@_fast
-def chain_adjoint(cotangent, centers, directions, squares, states, kernels):  # type: ignore[no-untyped-def]
-    """The adjoint sweep: from dloss/dψ (n, N) to the gradients of centres, directions and ρ²."""
-    cotangent = cotangent.copy()
-    d_centers, d_directions = np.empty_like(centers), np.empty_like(directions)
-    d_squares = np.empty_like(squares)
-    along = np.empty(cotangent.shape[1])
-    for j in range(centers.shape[0] - 1, -1, -1):
-        along[:] = 0.0
-        for a in range(cotangent.shape[0]):
-            total = 0.0
-            for i in range(cotangent.shape[1]):
-                along[i] += directions[j, a] * cotangent[a, i]
-                total += kernels[j, i] * cotangent[a, i]
-            d_directions[j, a] = total
-        for i in range(cotangent.shape[1]):
-            along[i] *= kernels[j, i]
-        square = 0.0
-        for a in range(cotangent.shape[0]):
-            total = 0.0
-            for i in range(cotangent.shape[1]):
-                offset = states[j, a, i] - centers[j, a]
-                square -= along[i] * offset * offset
-                change = -2.0 * squares[j] * along[i] * offset
-                cotangent[a, i] += change
-                total -= change
-            d_centers[j, a] = total
-        d_squares[j] = square
-    return d_centers, d_directions, d_squares
+@cache
+def forward_adjoint(dim: int, tangents: int) -> Any:
+    """Of ψ and J_ψ: from dloss/dψ(x) and dloss/d(J_ψ t) to those of points, tangents and layers.
+
+    x and x_out are (m, n), gx (m, n) or (1, n); t is (m, n·T) or (1, n·T), gt and t_out (m, n·T). ``sums``
+    (M, 8·(2n+1)) takes, for each layer, what to add up over eight lanes for c, v and ρ².
+    """
+    entries = 2 * dim + 1
+
+    def sweep(layers: Array, x: Array, t: Array, gx: Array, gt: Array, x_out: Array, t_out: Array, sums: Array) -> None:
+        count = len(layers)
+        at_t, at_gx, at_gt = dim * ROWS, (dim + dim * tangents) * ROWS, (2 * dim + dim * tangents) * ROWS
+        held = np.zeros((2 * dim + 2 * dim * tangents) * ROWS)  # x; t; their cotangents
+        row = (dim + 1 + tangents) * ROWS  # x before a layer; k; the tangents' growth
+        kept = np.empty(count * row)
+        near = np.empty((count, ROWS // WIDTH), np.bool_)
+        total = sums.reshape(sums.size)
+        for begin in range(0, len(x), ROWS):
+            size = min(ROWS, len(x) - begin)
+            padded = (size + WIDTH - 1) // WIDTH * WIDTH
+            for i in range(padded):
+                point = begin + min(i, size - 1)
+                for d in range(dim):
+                    held[d * ROWS + i] = x[point, d]
+                    held[at_gx + d * ROWS + i] = gx[min(point, len(gx) - 1), d] if i < size else 0.0
+                for e in range(dim * tangents):
+                    held[at_t + e * ROWS + i] = t[min(point, len(t) - 1), e]
+                    held[at_gt + e * ROWS + i] = gt[point, e] if i < size else 0.0
+            for j in range(count):
+                q, here = layers[j, 2 * dim], j * row
+                for u in range(0, padded, WIDTH):
+                    w = load(held, u, WIDTH) - layers[j, 0]
+                    distance = w * w
+                    for d in range(1, dim):
+                        w = load(held, d * ROWS + u, WIDTH) - layers[j, d]
+                        distance = distance + w * w
+                    near[j, u // WIDTH] = anywhere(distance * q < NEGLIGIBLE)
+                    if not near[j, u // WIDTH]:
+                        continue
+                    k = exp(distance * -q)
+                    store(kept, here + dim * ROWS + u, k)
+                    for e in range(tangents):
+                        along = k * 0.0
+                        for d in range(dim):
+                            w = load(held, d * ROWS + u, WIDTH) - layers[j, d]
+                            along = along + w * load(held, at_t + (d * tangents + e) * ROWS + u, WIDTH)
+                        along = where(k > 0.0, -2.0 * q * k * along, k)  # 0·inf is not a number
+                        store(kept, here + (dim + 1 + e) * ROWS + u, along)
+                        for d in range(dim):
+                            place = at_t + (d * tangents + e) * ROWS + u
+                            store(held, place, load(held, place, WIDTH) + along * layers[j, dim + d])
+                    for d in range(dim):
+                        moved = load(held, d * ROWS + u, WIDTH)
+                        store(kept, here + d * ROWS + u, moved)
+                        store(held, d * ROWS + u, moved + k * layers[j, dim + d])
+            for j in range(count - 1, -1, -1):
+                q, here, sum_at = layers[j, 2 * dim], j * row, j * entries * WIDTH
+                for u in range(0, padded, WIDTH):
+                    if not near[j, u // WIDTH]:
+                        continue
+                    k = load(kept, here + dim * ROWS + u, WIDTH)
+                    slope = -2.0 * q * k
+                    distance, along = k * 0.0, k * 0.0
+                    for d in range(dim):
+                        w = load(kept, here + d * ROWS + u, WIDTH) - layers[j, d]
+                        distance = distance + w * w
+                        cotangent = load(held, at_gx + d * ROWS + u, WIDTH)
+                        along = along + cotangent * layers[j, dim + d]
+                        place = sum_at + (dim + d) * WIDTH
+                        store(total, place, load(total, place, WIDTH) + k * cotangent)
+                    of_square = along * k * distance * -1.0
+                    of_offset = along * slope  # times x - c: what the point's cotangent gains
+                    for e in range(tangents):
+                        grown = load(kept, here + (dim + 1 + e) * ROWS + u, WIDTH)
+                        beta = k * 0.0
+                        for d in range(dim):
+                            place = at_t + (d * tangents + e) * ROWS + u
+                            store(held, place, load(held, place, WIDTH) - grown * layers[j, dim + d])
+                            cotangent = load(held, at_gt + (d * tangents + e) * ROWS + u, WIDTH)
+                            beta = beta + cotangent * layers[j, dim + d]
+                            place = sum_at + (dim + d) * WIDTH
+                            store(total, place, load(total, place, WIDTH) + grown * cotangent)
+                        of_square = of_square + beta * grown * (1.0 / q - distance)
+                        of_offset = of_offset - 2.0 * q * beta * grown
+                        for d in range(dim):
+                            w = load(kept, here + d * ROWS + u, WIDTH) - layers[j, d]
+                            place = at_gt + (d * tangents + e) * ROWS + u
+                            store(held, place, load(held, place, WIDTH) + beta * slope * w)
+                            change = beta * slope * load(held, at_t + (d * tangents + e) * ROWS + u, WIDTH)
+                            place = at_gx + d * ROWS + u
+                            store(held, place, load(held, place, WIDTH) + change)
+                            place = sum_at + d * WIDTH
+                            store(total, place, load(total, place, WIDTH) - change)
+                    for d in range(dim):
+                        change = of_offset * (load(kept, here + d * ROWS + u, WIDTH) - layers[j, d])
+                        place = at_gx + d * ROWS + u
+                        store(held, place, load(held, place, WIDTH) + change)
+                        place = sum_at + d * WIDTH
+                        store(total, place, load(total, place, WIDTH) - change)
+                    place = sum_at + 2 * dim * WIDTH
+                    store(total, place, load(total, place, WIDTH) + of_square)
+            for i in range(size):
+                for d in range(dim):
+                    x_out[begin + i, d] = held[at_gx + d * ROWS + i]
+                for e in range(dim * tangents):
+                    t_out[begin + i, e] = held[at_gt + e * ROWS + i]
+
+    return compiled(sweep, f"void({', '.join(['float64[:, ::1]'] * 8)})")
+
+
+@cache
+def inverse_adjoint(dim: int) -> Any:
+    """Of ψ⁻¹: from x = ψ⁻¹(y) and dloss/dx (m, n) to dloss/dy (m, n) and, into ``sums``, those of the layers.
+
+    It climbs from x through the layers, so that no root is sought: there (I + v ∇kᵀ) dx = dy - k dv - v (∂k).
+    """
+    entries = 2 * dim + 1
+
+    def sweep(layers: Array, x: Array, gx: Array, y_out: Array, sums: Array) -> None:
+        held = np.zeros(2 * dim * ROWS)
+        at_g = dim * ROWS
+        total = sums.reshape(sums.size)
+        for begin in range(0, len(x), ROWS):
+            size = min(ROWS, len(x) - begin)
+            padded = (size + WIDTH - 1) // WIDTH * WIDTH
+            for i in range(padded):
+                for d in range(dim):
+                    held[d * ROWS + i] = x[begin + min(i, size - 1), d]
+                    held[at_g + d * ROWS + i] = gx[begin + i, d] if i < size else 0.0
+            for j in range(len(layers)):
+                q, sum_at = layers[j, 2 * dim], j * entries * WIDTH
+                for u in range(0, padded, WIDTH):
+                    w = load(held, u, WIDTH) - layers[j, 0]
+                    distance = w * w
+                    for d in range(1, dim):
+                        w = load(held, d * ROWS + u, WIDTH) - layers[j, d]
+                        distance = distance + w * w
+                    if not anywhere(distance * q < NEGLIGIBLE):
+                        continue
+                    k = exp(distance * -q)
+                    slope = -2.0 * q * k
+                    along, swell = k * 0.0, k * 0.0 + 1.0
+                    for d in range(dim):
+                        w = load(held, d * ROWS + u, WIDTH) - layers[j, d]
+                        along = along + load(held, at_g + d * ROWS + u, WIDTH) * layers[j, dim + d]
+                        swell = swell + where(k > 0.0, slope * w, k) * layers[j, dim + d]
+                    beta = along / swell
+                    for d in range(dim):
+                        moved = load(held, d * ROWS + u, WIDTH)
+                        change = beta * where(k > 0.0, slope * (moved - layers[j, d]), k)
+                        cotangent = load(held, at_g + d * ROWS + u, WIDTH) - change
+                        store(held, at_g + d * ROWS + u, cotangent)
+                        store(held, d * ROWS + u, moved + k * layers[j, dim + d])
+                        place = sum_at + d * WIDTH
+                        store(total, place, load(total, place, WIDTH) + change)
+                        place = sum_at + (dim + d) * WIDTH
+                        store(total, place, load(total, place, WIDTH) - k * cotangent)
+                    place = sum_at + 2 * dim * WIDTH
+                    store(total, place, load(total, place, WIDTH) + where(k > 0.0, beta * k * distance, k))
+            for i in range(size):
+                for d in range(dim):
+                    y_out[begin + i, d] = held[at_g + d * ROWS + i]
+
+    return compiled(sweep, f"void({', '.join(['float64[:, ::1]'] * 5)})")

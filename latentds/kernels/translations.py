@@ -20,17 +20,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from . import dispatch
+from .adjoint import NEGLIGIBLE, forward_adjoint, inverse_adjoint
 from .compiling import OPTIONS, compiled
-from .dispatch import evaluate, is_plain, no_active_transforms, rows_of, run, tensor_of
+from .dispatch import BLOCK, evaluate, is_plain, no_active_transforms, rows_of, run, tensor_of
 from .lanes import WIDTH, anywhere, either, exp, load, store, where
 
 Array = NDArray[np.float64]
 
 PARAMETERS = ("centers", "log_widths", "strengths")
 """Of the module, in the order in which the kernels take them."""
-
-NEGLIGIBLE = 60.0
-"""A layer with exp(-60) = 9e-27 of its translation at a point leaves the point as it is."""
 
 BEYOND = 80.0
 """ρ²‖y-c‖² from which the layer's solution s lies below exp(-60): √80 >= √60 + ρ‖v‖, since ρ‖v‖ < √(e/2)."""
@@ -40,26 +38,32 @@ can_use_kernel = partial(dispatch.can_use_kernel, PARAMETERS)
 
 def forward(module: Any, x: Tensor) -> Tensor:
     """ψ of a :class:`~latentds.LocallyWeightedTranslations`; so are those below."""
-    return evaluate(partial(_forward, layers_of(module)), type(module).forward, PARAMETERS, module, x)
+    layers = layers_of(module)
+    adjoint = partial(_forward_adjoint, layers)
+    return evaluate(partial(_forward, layers), adjoint, type(module).forward, PARAMETERS, module, x)
 
 
 def inverse(module: Any, y: Tensor) -> Tensor:
-    return evaluate(partial(_inverse, layers_of(module)), type(module).inverse, PARAMETERS, module, y)
+    layers = layers_of(module)
+    adjoint = partial(_inverse_adjoint, layers)
+    return evaluate(partial(_inverse, layers), adjoint, type(module).inverse, PARAMETERS, module, y)
 
 
 def jacobian(module: Any, x: Tensor) -> Tensor:
-    return evaluate(partial(_jacobian, layers_of(module)), type(module).jacobian, PARAMETERS, module, x)
+    layers = layers_of(module)
+    adjoint = partial(_jacobian_adjoint, layers)
+    return evaluate(partial(_jacobian, layers), adjoint, type(module).jacobian, PARAMETERS, module, x)
 
 
 def linearize(module: Any, y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-    layers = layers_of(module)
-    x = evaluate(partial(_inverse, layers), type(module).inverse, PARAMETERS, module, y)
+    layers, x = layers_of(module), inverse(module, y)
 
     def push(tangent: Tensor) -> Tensor:
         if not (no_active_transforms() and is_plain(tangent, x.dtype)):
             return _pushed(module, x, tangent)
         points, tangents = torch.broadcast_tensors(x, tangent)  # type: ignore[no-untyped-call]
-        return evaluate(partial(_push, layers), _pushed, PARAMETERS, module, points, tangents)
+        adjoint = partial(_push_adjoint, layers)
+        return evaluate(partial(_push, layers), adjoint, _pushed, PARAMETERS, module, points, tangents)
 
     return x, push
 
@@ -70,11 +74,25 @@ def _pushed(module: Any, x: Tensor, tangent: Tensor) -> Tensor:
 
 
 def _forward(layers: Array, x: Tensor) -> Tensor:
-    points = rows_of(x)
-    out, nothing = np.empty_like(points), np.empty((1, 0))
+    return tensor_of(_moved(layers, rows_of(x)), x, x.shape)
+
+
+def _moved(layers: Array, points: Array) -> Array:
+    out = np.empty_like(points)
     kernel = partial(forward_kernel, points.shape[1], 0)
-    run(kernel, layers, points, nothing, out, np.empty((len(points), 0)))
-    return tensor_of(out, x, x.shape)
+    run(kernel, layers, points, np.empty((1, 0)), out, np.empty((len(points), 0)))
+    return out
+
+
+def forward_and_adjoint(layers: Array, points: Array) -> tuple[Array, Callable[[Array], Array]]:
+    """ψ of points (m, n), and the map from dloss/dψ to that of the layers' c, v and ρ²: (m, n) -> (M, 2n+1)."""
+    nothing = np.empty((len(points), 0))
+
+    def adjoint(of_moved: Array) -> Array:
+        kernel = forward_adjoint(points.shape[1], 0)
+        return _summed(kernel, layers, points, nothing, of_moved, nothing, np.empty_like(points), nothing)
+
+    return _moved(layers, points), adjoint
 
 
 def _inverse(layers: Array, y: Tensor) -> Tensor:
@@ -96,6 +114,68 @@ def _jacobian(layers: Array, x: Tensor) -> Tensor:
     moved, out = np.empty_like(points), np.empty((len(points), dim * dim))
     run(partial(forward_kernel, dim, dim), layers, points, np.eye(dim).reshape(1, -1), moved, out)
     return tensor_of(out, x, (*x.shape, dim))
+
+
+def _forward_adjoint(layers: Array, gradient: Tensor, value: Tensor, x: Tensor) -> Any:
+    nothing = np.empty((value[..., 0].numel(), 0))
+    of_x, _, through = _adjoint(layers, x, np.empty((1, 0)), rows_of(gradient), nothing)
+    return (tensor_of(of_x, x, x.shape),), through
+
+
+def _push_adjoint(layers: Array, gradient: Tensor, value: Tensor, x: Tensor, tangent: Tensor) -> Any:
+    of_x, of_tangent, through = _adjoint(layers, x, rows_of(tangent), np.zeros((1, x.shape[-1])), rows_of(gradient))
+    return (tensor_of(of_x, x, x.shape), tensor_of(of_tangent, x, x.shape)), through
+
+
+def _jacobian_adjoint(layers: Array, gradient: Tensor, value: Tensor, x: Tensor) -> Any:
+    dim = x.shape[-1]
+    of_tangents = rows_of(gradient.flatten(-2))
+    of_x, _, through = _adjoint(layers, x, np.eye(dim).reshape(1, -1), np.zeros((1, dim)), of_tangents)
+    return (tensor_of(of_x, x, x.shape),), through
+
+
+def _adjoint(layers: Array, x: Tensor, tangents: Array, of_x: Array, of_tangents: Array) -> tuple[Array, Array, Any]:
+    """From the gradients of ψ(x) and of the pushed tangents to those of x, the tangents and the layers."""
+    points, dim = rows_of(x), x.shape[-1]
+    found, of_given = np.empty_like(points), np.empty_like(of_tangents)
+    kernel = forward_adjoint(dim, of_tangents.shape[1] // dim)
+    sums = _summed(kernel, layers, points, tangents, of_x, of_tangents, found, of_given)
+    return found, of_given, partial(_of_layers, sums)
+
+
+def _inverse_adjoint(layers: Array, gradient: Tensor, value: Tensor, y: Tensor) -> Any:
+    points = rows_of(value)
+    found = np.empty_like(points)
+    sums = _summed(inverse_adjoint(points.shape[1]), layers, points, rows_of(gradient), found)
+    return (tensor_of(found, y, y.shape),), partial(_of_layers, sums)
+
+
+def _summed(kernel: Callable[..., None], layers: Array, points: Array, *by_row: Array) -> Array:
+    """Run an adjoint kernel; what it adds up over the points for c, v and ρ² of every layer, (M, 2n+1)."""
+    shape = (len(layers), points.shape[1] * 2 + 1, WIDTH)
+    parts: list[tuple[int, Array]] = []
+
+    def sweep(layers: Array, points: Array, *by_row: Array) -> None:
+        count = len(points)
+        for cut in range(0, count, BLOCK):
+            sums = np.zeros(shape)
+            rows = (a[cut : cut + BLOCK] if len(a) == count else a for a in (points, *by_row))
+            kernel(layers, *rows, sums.reshape(len(sums), -1))
+            parts.append((points[cut:].ctypes.data, sums.sum(-1)))
+
+    run(lambda block: sweep, layers, points, *by_row)
+    # block by block and in the order of the points: to the last bit the same on any number of cores
+    total = np.zeros(shape[:2])
+    for _, part in sorted(parts, key=lambda part: part[0]):
+        total += part
+    return total + (math.nan if np.isnan(points.sum()) else 0.0)  # as on the torch path
+
+
+def _of_layers(sums: Array, module: Any) -> tuple[Tensor, Tensor]:
+    """What the parameters make of each layer, a row (c, v, ρ²), and its gradient."""
+    squares = torch.exp(2 * module.log_widths).unsqueeze(-1)
+    made = torch.cat([module.centers, module.directions, squares], dim=-1)
+    return made, torch.from_numpy(sums).to(made)
 
 
 def layers_of(module: Any) -> Array:
