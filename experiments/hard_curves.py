@@ -48,7 +48,7 @@ def curves(seed: int = 0) -> Iterator[Curve]:
 
 
 def _shown(path: Array, name: str) -> Demonstration:
-    return Demonstration(torch.from_numpy(path), 5 / (len(path) - 1), name)
+    return Demonstration(torch.from_numpy(np.ascontiguousarray(path)), 5 / (len(path) - 1), name)
 
 
 def _even(count: int = 1000) -> Array:

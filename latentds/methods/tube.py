@@ -43,6 +43,12 @@ FINE = 500
 """Steps of a homotopy that is tracked; it takes several at once where strands are far apart."""
 TRACKED = (3.0, 1.5)
 """Least widths of a layer in distances between points that are tried when a homotopy is tracked."""
+SEARCH_SECONDS = 12.0
+"""CPU seconds after which no further match is tried; the last one may take two more."""
+SHOWS = 0.01
+"""Miss of the demonstration itself, in its sizes, above which a fit that chooses its depth says so."""
+BLURRED = 0.02
+"""Noise or steps of a recording, in its sizes, from which on a deeper search is of no use."""
 CLEAR = 0.02
 """Least share of their distance that strands keep on a linear homotopy worth tracking."""
 FINEST = 4800
@@ -212,6 +218,7 @@ class TubeDS(LatentDS):
         score *= max(1.0, condition / MAX_CONDITION)
         return score if math.isfinite(score) else math.inf
 
+    @torch.no_grad()
     def _followed(
         self, found: Candidate, path: Array, shape: Demonstration, law: PiecewiseLinearLaw
     ) -> tuple[Candidate, tuple[str, ...]]:
@@ -227,22 +234,33 @@ class TubeDS(LatentDS):
             told = measure(self, wanted)
             return max(told.miss / START_MISS, *(bad for bad, _ in told.findings))
 
+        began, blur = time.thread_time(), _blur(shape)
         best, least, dense = found, badness(found), crowded(fine, MOST_POINTS)
-        tried = [] if least <= 1 else _deeper(path, dense, self.homotopy)
+        tried = () if least <= 1 or blur else _deeper(path, dense, self.homotopy)
         again: list[tuple[float, Candidate]] = []
+        stopped = False
         for candidate in tried:
             again.append((badness(candidate), candidate))
-            if again[-1][0] <= 1:
+            stopped = time.thread_time() - began > SEARCH_SECONDS
+            if again[-1][0] <= 1 or stopped:
                 break
         else:
             for _, candidate in sorted(again, key=lambda pair: pair[0])[: 1 if self.refined else 0]:
                 better = candidate.refined(dense if len(candidate.line) == len(dense) else path, 100)
                 again.append((badness(better), better))
         best, least = min([(least, best), *again], key=lambda pair: pair[0])[::-1]
-        if least <= 1:
-            return best, ()
-        near = float(Strands(path, N_POINTS).clearance(path).min())
-        return best, (f"no match tried follows the path closely; its strands come within {near:.2g} of its size",)
+        self._take(best, shape, law)
+        motion = self.rollout(shape.start.to(self.attractor), torch.from_numpy(even)).cpu().numpy()
+        missed = dtw(motion, shape.at(even)) / len(even) / shape.size
+        notes = [blur] if blur else []
+        if least > 1 and not blur:
+            near, spent = float(Strands(path, N_POINTS).clearance(path).min()), ""
+            if stopped:
+                spent = f", and the search stopped after {SEARCH_SECONDS:g} s"
+            notes.append(f"no match tried follows the path closely; its strands come within {near:.2g} of its size{spent}")
+        if not missed <= SHOWS:
+            notes.append(f"misses the demonstration itself by {missed:.2g} of its size")
+        return best, tuple(notes)
 
     def _line(self) -> Tensor:
         """Latent points from the encoded start to x*, one for each of the path, (N_POINTS, n)."""
@@ -256,7 +274,7 @@ class TubeDS(LatentDS):
     ) -> TubeReport:
         line, frame = self._line(), self.frame()
         across = torch.linalg.svd(frame.axis.unsqueeze(-1))[0][:, 1:].T * TUBE * frame.length
-        tube = torch.cat([line, *(line[::4] + side * offset for offset in across for side in (1, -1))])
+        tube = torch.cat([line, *(line[:: max(4, self.dim**2 // 16)] + side * offset for offset in across for side in (1, -1))])
         missed = torch.linalg.vector_norm(self.diffeomorphism(line).cpu() - torch.from_numpy(path), dim=-1).mean()
         y = self.diffeomorphism(tube)
         step = 1e-6 * shown.size
@@ -345,6 +363,21 @@ def _deeper(path: Array, dense: Array, homotopy: str) -> Iterator[Candidate]:
         yield from tracked("unbending", curvature_homotopy(dense, FINE))
         for pivot in (0.5, 0.0, 1.0):
             yield from tracked("unbending", zoom_homotopy(dense, FINE, pivot))
+
+
+def _blur(shown: Demonstration) -> str:
+    """What hides the motion in a recording: noise, read off its fourth differences, or steps; "" if little does."""
+    positions = shown.positions.numpy()
+    if len(positions) < 10:
+        return ""
+    noise = float(np.median(np.linalg.norm(np.diff(positions, 4, axis=0), axis=1))) / math.sqrt(70) / shown.size
+    if noise > BLURRED:
+        return f"noise of {noise:.2g} of its size hides the motion"
+    moves = np.abs(np.diff(positions, axis=0))
+    steps = [float(np.median(one[one > 0])) for one in moves.T if 0 < np.count_nonzero(one) < len(one) / 2]
+    if steps and max(steps) > BLURRED * shown.size:
+        return f"recorded in steps of {max(steps) / shown.size:.2g} of its size, which hide the motion between them"
+    return ""
 
 
 def mean_motion(shown: Sequence[Demonstration]) -> tuple[Demonstration, tuple[float, ...]]:
