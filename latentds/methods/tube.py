@@ -254,10 +254,10 @@ class TubeDS(LatentDS):
         missed = dtw(motion, shape.at(even)) / len(even) / shape.size
         notes = [blur] if blur else []
         if least > 1 and not blur:
-            near, spent = float(Strands(path, N_POINTS).clearance(path).min()), ""
+            near = float(Strands(path, N_POINTS).clearance(path).min())
+            notes.append(f"no match tried follows the path closely; its strands come within {near:.2g} of its size")
             if stopped:
-                spent = f", and the search stopped after {SEARCH_SECONDS:g} s"
-            notes.append(f"no match tried follows the path closely; its strands come within {near:.2g} of its size{spent}")
+                notes.append(f"the search for a match stopped after {SEARCH_SECONDS:g} s")
         if not missed <= SHOWS:
             notes.append(f"misses the demonstration itself by {missed:.2g} of its size")
         return best, tuple(notes)
@@ -274,7 +274,8 @@ class TubeDS(LatentDS):
     ) -> TubeReport:
         line, frame = self._line(), self.frame()
         across = torch.linalg.svd(frame.axis.unsqueeze(-1))[0][:, 1:].T * TUBE * frame.length
-        tube = torch.cat([line, *(line[:: max(4, self.dim**2 // 16)] + side * offset for offset in across for side in (1, -1))])
+        some = line[:: max(4, self.dim**2 // 16)]
+        tube = torch.cat([line, *(some + side * offset for offset in across for side in (1, -1))])
         missed = torch.linalg.vector_norm(self.diffeomorphism(line).cpu() - torch.from_numpy(path), dim=-1).mean()
         y = self.diffeomorphism(tube)
         step = 1e-6 * shown.size
