@@ -316,7 +316,9 @@ class Candidate(NamedTuple):
         return self._replace(layers=layers, line=origin + unit * self.line)
 
     def mse(self, path: Array) -> float:
-        line = self.line[:1] + np.linspace(0, 1, len(path))[:, None] * (self.line[-1] - self.line[0])
+        line = self.line
+        if len(line) != len(path):  # matched on points that crowd where strands are close
+            line = line[:1] + np.linspace(0, 1, len(path))[:, None] * (line[-1] - line[0])
         return float(np.square(apply_layers(self.layers, line) - path).mean())
 
 
