@@ -134,6 +134,7 @@ class LocallyWeightedTranslations(Diffeomorphism):
     Args:
         dim: n >= 1.
         n_layers: M >= 1.
+        any_number: whether as many as are assigned or loaded replace them.
 
     Attributes:
         centers: c, (M, n) parameter.
@@ -141,16 +142,22 @@ class LocallyWeightedTranslations(Diffeomorphism):
         strengths: a, (M, n) parameter.
     """
 
-    def __init__(self, dim: int, n_layers: int) -> None:
+    def __init__(self, dim: int, n_layers: int, *, any_number: bool = False) -> None:
         super().__init__()
         self.dim = whole_number(dim, "dim", at_least=1)
-        self.n_layers = whole_number(n_layers, "n_layers", at_least=1)
-        self.centers = nn.Parameter(torch.zeros(n_layers, dim, dtype=torch.float64))
-        self.log_widths = nn.Parameter(torch.zeros(n_layers, dtype=torch.float64))
-        self.strengths = nn.Parameter(torch.zeros(n_layers, dim, dtype=torch.float64))
+        self.any_number = any_number
+        count = whole_number(n_layers, "n_layers", at_least=1)
+        self.centers = nn.Parameter(torch.zeros(count, dim, dtype=torch.float64))
+        self.log_widths = nn.Parameter(torch.zeros(count, dtype=torch.float64))
+        self.strengths = nn.Parameter(torch.zeros(count, dim, dtype=torch.float64))
 
     def extra_repr(self) -> str:
         return f"dim={self.dim}, n_layers={self.n_layers}"
+
+    @property
+    def n_layers(self) -> int:
+        """M"""
+        return len(self.centers)
 
     @property
     def widths(self) -> Tensor:
@@ -175,7 +182,7 @@ class LocallyWeightedTranslations(Diffeomorphism):
         """Take given layers; the rest, if fewer than M come, become the identity.
 
         Args:
-            centers: (m, n), m <= M.
+            centers: (m, n), m <= M unless any number is taken.
             directions: (m, n).
             widths: (m,), > 0.
 
@@ -183,6 +190,8 @@ class LocallyWeightedTranslations(Diffeomorphism):
             ValueError: if a layer breaks the invertibility bound.
         """
         used = len(centers)
+        if self.any_number:
+            self._make_room(used)
         squared = (widths.unsqueeze(-1) * directions / WIDTH_BOUND).square().sum(-1)
         if used > self.n_layers or not bool((squared < 1).all()) or not bool((widths > 0).all()):
             raise ValueError(
@@ -193,6 +202,17 @@ class LocallyWeightedTranslations(Diffeomorphism):
         self.strengths.zero_()[:used] = strengths_of(directions, widths).to(self.strengths)
         self.log_widths.zero_()[:used] = widths.log().to(self.log_widths)
         self.log_widths[used:] = self.log_widths[:used].mean() if used else 0.0
+
+    def _make_room(self, count: int) -> None:
+        """Parameters of so many layers, at least one; the same objects, so that an optimiser keeps hold of them."""
+        for parameter in (self.centers, self.log_widths, self.strengths):
+            parameter.data = parameter.data.new_zeros((max(1, count), *parameter.shape[1:]))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        centers = state_dict.get(prefix + "centers")
+        if self.any_number and centers is not None and centers.ndim == 2:
+            self._make_room(len(centers))
+        super()._load_from_state_dict(state_dict, prefix, *rest)
 
     @eager_for_derivatives
     def forward(self, x: Tensor) -> Tensor:

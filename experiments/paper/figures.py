@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 from numpy.typing import NDArray
 
-from experiments.paper.tuning import Tried
 from latentds import ChebyshevDS, Demonstration, LatentDS, StableDS
 from latentds.fitting.embedding import chebyshev_columns
+from latentds.fitting.tuning import Tried
 from latentds.plotting import SHOWN, color_of
 
 Array = NDArray[np.float64]

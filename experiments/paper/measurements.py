@@ -21,6 +21,7 @@ from experiments.published import TABLE_ONE, TABLE_TWO, Size
 from experiments.scores import level, welch
 from latentds import Demonstration, StableDS, datasets, metrics
 from latentds.benchmark import Cell, Outcome
+from latentds.fitting.tuning import choose
 
 Array = NDArray[np.float64]
 
@@ -45,14 +46,14 @@ def tuned(study: Study) -> pd.DataFrame:
     for shown in study.spirals:
         for method in RIVALS:
             grid, more = study.tried(method, shown)
-            choice, paper = tuning.choose(grid), TABLE_ONE[method].get(shown.name)
+            choice, paper = choose(grid), TABLE_ONE[method].get(shown.name)
             lines.append(
                 {
                     "spiral": shown.name,
                     "method": method,
                     "paper": paper,
                     "choice": choice,
-                    "with TPE": tuning.choose([*grid, *more]).least_mse.n_layers,
+                    "with TPE": choose([*grid, *more]).least_mse.n_layers,
                     "fewer": paper and choice.good and choice.least_mse.n_layers <= paper.n_layers,
                 }
             )
@@ -121,7 +122,7 @@ def planes(study: Study) -> tuple[pd.DataFrame, list[Demonstration], dict[str, d
     written = motions.handwriting() if study.plan.lasa else {}
     lines, fitted = [], {}
     for shown in [*drawn, *(written[shape][0] for shape in study.plan.lasa if written)]:
-        chosen = {method: study.choice(method, shown).least_beta.setting for method in RIVALS}
+        chosen = {method: tuning.setting(study.choice(method, shown).least_beta) for method in RIVALS}
         cells = [Cell(method, greedy(method, setting), shown) for method, setting in chosen.items()]
         outcomes = study.run(cells, study.protocol(radius=NEAR * shown.size))
         near = rows(outcomes).query("start > 0").groupby("method")["dtw_per_point"]
@@ -139,7 +140,7 @@ def planes(study: Study) -> tuple[pd.DataFrame, list[Demonstration], dict[str, d
 def joints(study: Study) -> tuple[pd.DataFrame, list[Demonstration], list[Outcome]]:
     """FastDTW and exact DTW of both rivals from the demonstrated start; the motions; their rollouts."""
     shown = list(study.recorded) or [datasets.joint_motion(seed) for seed in range(study.plan.arms)]
-    chosen = {d.name: {method: study.choice(method, d).least_beta.setting for method in RIVALS} for d in shown}
+    chosen = {d.name: {method: tuning.setting(study.choice(method, d).least_beta) for method in RIVALS} for d in shown}
     cells = [Cell(method, greedy(method, setting), d) for d in shown for method, setting in chosen[d.name].items()]
     outcomes = study.run(cells, study.protocol(n_starts=0))
     found = rows(outcomes).set_index(["demonstration", "method"])

@@ -10,7 +10,7 @@ import pandas as pd
 
 from experiments import motions
 from experiments.methods import RIVALS, greedy
-from experiments.paper import figures, latent_space, measurements, verdicts
+from experiments.paper import figures, latent_space, measurements, tuning, verdicts
 from experiments.paper.document import Document
 from experiments.paper.study import SDS_EF, Study, paths
 from experiments.published import TABLE_ONE, TABLE_THREE, Setting, Size
@@ -64,7 +64,7 @@ def tuned(study: Study, found: Document) -> None:
         ["spiral", "method", "paper", "ours, least β", "ours, least MSE", "M with TPE"],
         (
             [one["spiral"], one["method"], _brief(one["paper"]) if one["paper"] else "none printed"]
-            + [_brief(chosen.setting) for chosen in one["choice"][:2]]
+            + [_brief(tuning.setting(chosen)) for chosen in one["choice"][:2]]
             + [str(one["with TPE"])]
             for one in _each(lines)
         ),

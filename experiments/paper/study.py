@@ -19,6 +19,7 @@ from experiments.paper.plan import Plan
 from experiments.published import TABLE_ONE, TABLE_TWO, Setting
 from latentds import Demonstration
 from latentds.benchmark import Cell, Outcome, Protocol, run
+from latentds.fitting.tuning import Choice, Tried, choose
 
 SDS_EF = ("SDS-EF", "SDS-EF official")
 """By our recipe, and by its authors'."""
@@ -39,21 +40,21 @@ class Study:
         self.store = out / "cells.sqlite"
         self.tuner = tuning.Tuner(out / "optuna.sqlite", jobs)
         self.spirals = [spiral(name) for name in plan.spirals]
-        self._tuned: dict[tuple[str, str], tuple[list[tuning.Tried], list[tuning.Tried]]] = {}
+        self._tuned: dict[tuple[str, str], tuple[list[Tried], list[Tried]]] = {}
 
-    def tried(self, method: str, shown: Demonstration) -> tuple[list[tuning.Tried], list[tuning.Tried]]:
+    def tried(self, method: str, shown: Demonstration) -> tuple[list[Tried], list[Tried]]:
         """Of the grid, and of TPE."""
         key = method, shown.name
         if key not in self._tuned:
             self._tuned[key] = self.tuner.greedy(method, shown, self.plan.grid)
         return self._tuned[key]
 
-    def choice(self, method: str, shown: Demonstration) -> tuning.Choice:
-        return tuning.choose(self.tried(method, shown)[0])
+    def choice(self, method: str, shown: Demonstration) -> Choice:
+        return choose(self.tried(method, shown)[0])
 
     def setting(self, method: str, shown: Demonstration) -> Setting:
         """The paper's where it prints one, else its rule's with the least β."""
-        return TABLE_ONE[method].get(shown.name) or self.choice(method, shown).least_beta.setting
+        return TABLE_ONE[method].get(shown.name) or tuning.setting(self.choice(method, shown).least_beta)
 
     def protocol(self, *, n_starts: int | None = None, radius: float = 0.1) -> Protocol:
         """The plan's; ``n_starts`` of its own if given."""
@@ -71,8 +72,8 @@ class Study:
                 chosen = self.choice(method, shown)
                 for label, setting in {
                     method: self.setting(method, shown),
-                    f"{method}, least β": chosen.least_beta.setting,
-                    f"{method}, least MSE": chosen.least_mse.setting,
+                    f"{method}, least β": tuning.setting(chosen.least_beta),
+                    f"{method}, least MSE": tuning.setting(chosen.least_mse),
                 }.items():
                     cells.append(Cell(label, greedy(method, setting), shown))
         return self.run(cells, self.protocol())

@@ -19,12 +19,13 @@ from experiments.methods import GREEDY
 from experiments.published import Setting
 from latentds import Demonstration
 from latentds.fitting.matching import add_greedy_layers
+from latentds.fitting.tuning import BETAS, DEPTHS, GOOD, MUS
+from latentds.fitting.tuning import Choice as Choice
+from latentds.fitting.tuning import Tried as Tried
+from latentds.fitting.tuning import choose as choose
 from latentds.store import fingerprint
 
 Array = NDArray[np.float64]
-
-GOOD = 1e-5
-"""The normalised MSE that the paper asks for."""
 
 
 class Grid(NamedTuple):
@@ -37,49 +38,16 @@ class Grid(NamedTuple):
 
 
 FULL = Grid(
-    betas=tuple(i / 10 for i in range(1, 11)),
-    mus=tuple(i / 10 for i in range(1, 10)),
-    n_layers=(25, 50, 75, 100, 125, 150, 175, 200, 250, 300, 400, 500, 600, 750),
+    betas=BETAS,
+    mus=MUS,
+    n_layers=DEPTHS,
     n_more=20,
 )
 QUICK = Grid((0.3, 0.5, 0.7, 0.9), (0.6, 0.8, 0.9), (50, 75, 100, 150, 175, 200, 300, 750), n_more=3)
 
 
-class Tried(NamedTuple):
-    """One combination and what it reached; ``normalised`` is ``mse`` for a motion of radius 1."""
-
-    beta: float
-    mu: float
-    n_layers: int
-    mse: float
-    normalised: float
-
-    @property
-    def setting(self) -> Setting:
-        return Setting(*self[:4])
-
-
-class Choice(NamedTuple):
-    """The rule's two candidates among combinations with the same M, and whether they are below ``GOOD``."""
-
-    least_beta: Tried
-    least_mse: Tried
-    good: bool
-
-
-def choose(tried: Sequence[Tried]) -> Choice:
-    """The paper's rule: the fewest layers with a normalised MSE below 1e-5; among those the least β or the least MSE.
-
-    If none gets there, the least MSE. "Unless having slightly more diffeomorphisms significantly reduced MSE" names
-    no number and is not applied.
-    """
-    good = [one for one in tried if one.normalised < GOOD]
-    if not good:
-        least = min(tried, key=lambda one: one.mse)
-        return Choice(least, least, False)
-    fewest = min(one.n_layers for one in good)
-    equal = [one for one in good if one.n_layers == fewest]
-    return Choice(min(equal, key=lambda one: (one.beta, one.mse)), min(equal, key=lambda one: one.mse), True)
+def setting(one: Tried) -> Setting:
+    return Setting(*one[:4])
 
 
 def trace(method: str, shown: Demonstration, beta: float, mu: float, n_layers: Sequence[int]) -> list[float]:

@@ -15,6 +15,7 @@ from ..demonstration import Demonstration, goal_apart
 from ..diffeomorphism import WIDTH_BOUND, Layers, LocallyWeightedTranslations
 from ..fidelity import POINTS, ROUNDING, halves_apart
 from ..kernels.greedy import greedy_kernel
+from .strands import Strands
 
 Array = NDArray[np.float64]
 
@@ -59,6 +60,58 @@ def match_along(curves: Array, n_layers: int, beta: float, mu: float, narrowest:
     left = n_layers - sum(len(layers.widths) for layers in parts)
     parts.append(add_greedy_layers(moved, targets[-1], left, beta, mu, narrowest)[0])
     return Layers(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+STRIDE = 0.3
+"""Longest step along a homotopy that :func:`track` takes, in clearances of each point."""
+ON_THE_WAY, AT_THE_END = 0.1, 0.02
+"""Distance from a curve of the homotopy, in clearances, at which :func:`track` goes on to a further one, and ends."""
+AT_ONCE = 10
+"""Layers that it adds before it looks again."""
+STUCK = 1500
+"""Layers after which it gives up a step."""
+
+
+def track(curves: Array, most: int, narrowest: float) -> Layers | None:
+    """Greedy matching of the first curve to the last of (K+1, N, n), as closely as strands need; None if it gets lost.
+
+    From each curve the farthest one is aimed at that no point is more than ``STRIDE`` of its clearance away from, and
+    layers are added until every point is within ``ON_THE_WAY`` of it.
+
+    Args:
+        curves: a homotopy in fine steps.
+        most: layers.
+        narrowest: least width 1/ρ of a layer, or the least clearance where that is less.
+    """
+    clearance, moved, at, last = Strands(curves[-1]).clearance, curves[0], 0, len(curves) - 1
+    parts: list[Layers] = []
+    here, used = clearance(curves[0]), 0
+    while at < last:
+        step, ahead, there = 1, at + 1, clearance(curves[at + 1])
+        while at + 2 * step <= last:
+            farther = clearance(curves[at + 2 * step])
+            moves = np.linalg.norm(curves[at + 2 * step] - curves[at], axis=1)
+            if (moves > STRIDE * np.minimum(here, farther)).any():
+                break
+            step, there = 2 * step, farther
+            ahead = at + step
+        began, allowed = used, (ON_THE_WAY if ahead < last else AT_THE_END) * there
+        while ((missed := np.linalg.norm(moved - curves[ahead], axis=1)) > allowed).any():
+            if used - began >= STUCK or used >= most:
+                if ahead == last and (missed < ON_THE_WAY * there).all():
+                    break
+                return None
+            worst = int(np.argmax(missed / allowed))
+            tight = missed[worst] < 0.5 * missed.max()  # where strands are close, though others are farther off
+            count, place = (1, worst) if tight else (AT_ONCE, -1)
+            width = min(narrowest, float(there.min()))
+            layers, moved = add_greedy_layers(moved, curves[ahead], count, 0.9, 0.9, width, place)
+            if not len(layers.widths):
+                return None
+            parts.append(layers)
+            used += len(layers.widths)
+        at, here = ahead, there
+    return Layers(*(np.concatenate(columns) for columns in zip(*parts, strict=True))) if parts else None
 
 
 PINS = 2

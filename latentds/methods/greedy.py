@@ -19,9 +19,14 @@ from ..dynamics import RayDynamics
 from ..fitting.homotopy import linear_homotopy
 from ..fitting.matching import PINS, match_along, pin_ends, restore_on_failure
 from ..fitting.refinement import refine
+from ..fitting.tuning import tuned
 from ..time_law import TimeLaw
 
 Self = TypeVar("Self", bound="GreedyDS")
+
+
+BETA, MU = 0.5, 0.9
+"""The defaults of β and μ."""
 
 
 class GreedyDS(LatentDS):
@@ -31,7 +36,9 @@ class GreedyDS(LatentDS):
 
     Args:
         dim: n >= 1.
-        n_layers: M >= 1. The paper's Table I uses 50 to 750.
+        n_layers: M >= 1. The paper's Table I uses 50 to 750. None for the paper's own rule, which chooses β and μ too:
+            the fewest of 25 to 750 layers that bring the match's MSE, for a motion of radius 1, below 1e-5 with some
+            β and μ of a grid, or the least MSE if none do; in seconds. The report's notes say which.
         beta: β in (0, 1], the share of the largest error that a layer moves.
         mu: μ in (0, 1), how near to its invertibility bound a layer may come.
         steps: continuation steps of the matching; 1 is the paper's.
@@ -47,18 +54,23 @@ class GreedyDS(LatentDS):
         self,
         dim: int,
         *,
-        n_layers: int = 150,
-        beta: float = 0.5,
-        mu: float = 0.9,
+        n_layers: int | None = 150,
+        beta: float = BETA,
+        mu: float = MU,
         steps: int = 1,
         refined: bool = False,
         pinned: bool = True,
     ) -> None:
-        self.n_layers = whole_number(n_layers, "n_layers", at_least=1)
-        psi = LocallyWeightedTranslations(dim, self.n_layers + PINS * bool(pinned))
+        self.n_layers = None if n_layers is None else whole_number(n_layers, "n_layers", at_least=1)
+        count = (self.n_layers or 1) + PINS * bool(pinned)
+        psi = LocallyWeightedTranslations(dim, count, any_number=n_layers is None)
         super().__init__(dim, psi, RayDynamics(self.time_law(1.0)))
         self.beta = number_in(beta, "beta", 0, 1, ends="(]")
         self.mu = number_in(mu, "mu", 0, 1)
+        if n_layers is None and (self.beta, self.mu) != (BETA, MU):
+            raise ValueError(
+                f"n_layers: expected a number beside beta {self.beta:g} and mu {self.mu:g}, got None: it chooses both"
+            )
         self.steps = whole_number(steps, "steps", at_least=1)
         self.refined = bool(refined)
         self.pinned = bool(pinned)
@@ -79,12 +91,12 @@ class GreedyDS(LatentDS):
         psi, points = self.diffeomorphism, shown.positions.numpy()
         latent = self.latent_line(shown)
         with restore_on_failure(self, shown):
-            curves = linear_homotopy(latent, points, self.steps)
-            layers = match_along(curves, psi.n_layers - PINS * self.pinned, self.beta, self.mu)
+            n_layers, beta, mu, notes = self._hyperparameters(latent, points)
+            layers = match_along(linear_homotopy(latent, points, self.steps), n_layers, beta, mu)
             if self.refined:
-                layers = refine(layers, latent, points, self.mu)
+                layers = refine(layers, latent, points, mu)
             if self.pinned:
-                layers = pin_ends(layers, latent, points, self.mu)
+                layers = pin_ends(layers, latent, points, mu)
             psi.assign(*(torch.from_numpy(part) for part in layers))
             self.dynamics.law = self.time_law(shown.duration).to(self.attractor)
             with torch.no_grad():
@@ -92,5 +104,15 @@ class GreedyDS(LatentDS):
                 self.start.copy_(shown.start)
                 missed = psi(torch.from_numpy(latent).to(self.attractor)) - shown.positions.to(self.attractor)
             mse, seconds = float(missed.square().mean()), time.perf_counter() - began
-            self.fit_report = FitReport(mse, psi.n_layers, seconds, learned_from=(shown.fingerprint,))
+            self.fit_report = FitReport(mse, psi.n_layers, seconds, notes=notes, learned_from=(shown.fingerprint,))
         return self
+
+    def _hyperparameters(
+        self, latent: NDArray[np.float64], points: NDArray[np.float64]
+    ) -> tuple[int, float, float, tuple[str, ...]]:
+        """M, β and μ, and a note of those that were not given."""
+        if self.n_layers is not None:
+            return self.n_layers, self.beta, self.mu, ()
+        found = tuned(latent, points)
+        note = f"chose n_layers {found.n_layers}, beta {found.beta:g} and mu {found.mu:g} by the paper's rule"
+        return found.n_layers, found.beta, found.mu, (note,)

@@ -18,15 +18,43 @@ from ..base import FitReport, LatentDS
 from ..demonstration import Demonstration, demonstrations_of
 from ..diffeomorphism import Layers, LocallyWeightedTranslations
 from ..dynamics import TubeDynamics
+from ..fidelity import Excerpt, measure
 from ..fitting.embedding import arc_length_path, map_to_endpoints, straight_column
-from ..fitting.homotopy import curvature_homotopy, linear_homotopy
-from ..fitting.matching import apply_layers, match_along, restore_on_failure
+from ..fitting.homotopy import (
+    clear_direction,
+    curvature_homotopy,
+    drawn_homotopy,
+    linear_homotopy,
+    zoom_homotopy,
+)
+from ..fitting.matching import apply_layers, match_along, pin_ends, restore_on_failure, track
 from ..fitting.refinement import refine
+from ..fitting.strands import Strands, crowded, segment_distances
 from ..metrics import dtw
 from ..time_law import PiecewiseLinearLaw
 
 Array = NDArray[np.float64]
 
+DEPTHS = (300, 1000, 12000)
+"""Layers where none are asked for: of the first try; of one more; at most of matches that track a homotopy closely."""
+START_MISS = 0.005
+"""Largest distance of the motion from the demonstrated start and the path, in its sizes, that a fit is content with."""
+FINE = 500
+"""Steps of a homotopy that is tracked; it takes several at once where strands are far apart."""
+TRACKED = (3.0, 1.5)
+"""Least widths of a layer in distances between points that are tried when a homotopy is tracked."""
+SEARCH_SECONDS = 12.0
+"""CPU seconds after which no further match is tried; the last one may take two more."""
+SHOWS = 0.01
+"""Miss of the demonstration itself, in its sizes, above which a fit that chooses its depth says so."""
+BLURRED = 0.02
+"""Noise or steps of a recording, in its sizes, from which on a deeper search is of no use."""
+CLEAR = 0.02
+"""Least share of their distance that strands keep on a linear homotopy worth tracking."""
+FINEST = 4800
+"""Points of the path that a fit is held against, and …"""
+MOST_POINTS = 2000
+"""… at most so many of them, denser where strands are close, that it is then matched on."""
 N_POINTS = 600
 """Points, even in arc length, that ψ is matched on."""
 LINEAR = ((20, 1.0), (20, 2.0), (20, 4.0), (5, 2.0), (5, 4.0))
@@ -49,6 +77,8 @@ TRIES, CLOSE = 3, 1.3
 """So many matches are refined if they score within this factor of the best, …"""
 GOOD_SCORE = 0.06
 """… and further ones until one scores less than this, or three times this after so many."""
+HOPELESS = 1.0
+"""Where the best of so many scores more than this, and the depth is not given, more layers are the next to be tried."""
 FAR = 0.25
 """Distance from the axis, in sizes of the motion, beyond which the inward pull stops growing."""
 
@@ -90,7 +120,7 @@ class TubeDS(LatentDS):
 
     Args:
         dim: n >= 1.
-        n_layers: M >= 1.
+        n_layers: M >= 1; None for 300, or as many as it takes to follow the path: see ``DEPTHS``.
         contraction: κ > 0, per duration of the demonstration: a start off the path comes back within about
             3/κ of it. A larger κ costs proportionally larger velocity gradients (see the report).
         refined: whether L-BFGS refines the match; without it a fit takes a tenth of the time.
@@ -105,14 +135,15 @@ class TubeDS(LatentDS):
         self,
         dim: int,
         *,
-        n_layers: int = 300,
+        n_layers: int | None = None,
         contraction: float = 20.0,
         refined: bool = True,
         homotopy: str = "both",
     ) -> None:
         along, across = PiecewiseLinearLaw.uniform(), PiecewiseLinearLaw(torch.ones(1), torch.ones(1))
-        super().__init__(dim, LocallyWeightedTranslations(dim, n_layers), TubeDynamics(along, across))
-        self.n_layers = self.diffeomorphism.n_layers
+        psi = LocallyWeightedTranslations(dim, 1 if n_layers is None else n_layers, any_number=n_layers is None)
+        super().__init__(dim, psi, TubeDynamics(along, across))
+        self.n_layers = None if n_layers is None else psi.n_layers
         self.contraction = number_in(contraction, "contraction", 0, float("inf"))
         self.refined = bool(refined)
         known = ("linear", "curvature", "both") if self.dim > 1 else ("linear", "both")
@@ -132,7 +163,7 @@ class TubeDS(LatentDS):
         with restore_on_failure(self, shown):
             law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
             judged = []
-            for candidate in _candidates(path, self.diffeomorphism.n_layers, self.homotopy):
+            for candidate in _candidates(path, self.n_layers or DEPTHS[0], self.homotopy):
                 self._take(candidate, shape, law)
                 judged.append((self._score(shape), candidate))
             judged.sort(key=lambda pair: pair[0])
@@ -140,14 +171,19 @@ class TubeDS(LatentDS):
                 for tried, (score, candidate) in enumerate(list(judged)):
                     close = tried < TRIES and score < CLOSE * judged[0][0]
                     enough = min(score for score, _ in judged) < GOOD_SCORE * (1 if tried < TRIES else 3)
-                    if tried and enough and not close:
+                    hopeless = self.n_layers is None and tried >= TRIES and min(score for score, _ in judged) > HOPELESS
+                    if tried and (enough or hopeless) and not close:
                         break
                     better = candidate.refined(path)
                     self._take(better, shape, law)
                     judged.append((self._score(shape), better))
-            best = min(judged, key=lambda pair: pair[0])[1].placed(origin, unit)
+            found = min(judged, key=lambda pair: pair[0])[1]
+            notes: tuple[str, ...] = ()
+            if self.n_layers is None:
+                found, notes = self._followed(found, path, shape, law)
+            best = found.placed(origin, unit)
             self._take(best, shown, law)
-            report = self._report(best, origin + unit * path, shown, spread, began)
+            report = replace(self._report(best, origin + unit * path, shown, spread, began), notes=notes)
             self.fit_report = replace(report, learned_from=tuple(one.fingerprint for one in every))
         return self
 
@@ -182,6 +218,50 @@ class TubeDS(LatentDS):
         score *= max(1.0, condition / MAX_CONDITION)
         return score if math.isfinite(score) else math.inf
 
+    @torch.no_grad()
+    def _followed(
+        self, found: Candidate, path: Array, shape: Demonstration, law: PiecewiseLinearLaw
+    ) -> tuple[Candidate, tuple[str, ...]]:
+        """The match that was found, or a deeper one, the first that follows the path; what stood in the way if none."""
+        fine, way, times = arc_length_path(shape.positions.numpy(), shape.times.numpy(), FINEST)
+        even = np.linspace(0, times[-1], 8 * ROWS)
+        share = np.interp(even, times, 1 - way)
+        timed = np.stack([np.interp(share, np.linspace(0, 1, FINEST), column) for column in fine.T], 1)
+        wanted = (Excerpt.of(Demonstration(torch.from_numpy(timed), float(even[1]))),)
+
+        def badness(candidate: Candidate) -> float:
+            self._take(candidate, shape, law)
+            told = measure(self, wanted)
+            return max(told.miss / START_MISS, *(bad for bad, _ in told.findings))
+
+        began, blur = time.thread_time(), _blur(shape)
+        best, least, dense = found, badness(found), crowded(fine, MOST_POINTS)
+        tried = () if least <= 1 or blur else _deeper(path, dense, self.homotopy)
+        again: list[tuple[float, Candidate]] = []
+        stopped = False
+        for candidate in tried:
+            again.append((badness(candidate), candidate))
+            stopped = time.thread_time() - began > SEARCH_SECONDS
+            if again[-1][0] <= 1 or stopped:
+                break
+        else:
+            for _, candidate in sorted(again, key=lambda pair: pair[0])[: 1 if self.refined else 0]:
+                better = candidate.refined(dense if len(candidate.line) == len(dense) else path, 100)
+                again.append((badness(better), better))
+        best, least = min([(least, best), *again], key=lambda pair: pair[0])[::-1]
+        self._take(best, shape, law)
+        motion = self.rollout(shape.start.to(self.attractor), torch.from_numpy(even)).cpu().numpy()
+        missed = dtw(motion, shape.at(even)) / len(even) / shape.size
+        notes = [blur] if blur else []
+        if least > 1 and not blur:
+            near = float(Strands(path, N_POINTS).clearance(path).min())
+            notes.append(f"no match tried follows the path closely; its strands come within {near:.2g} of its size")
+            if stopped:
+                notes.append(f"the search for a match stopped after {SEARCH_SECONDS:g} s")
+        if not missed <= SHOWS:
+            notes.append(f"misses the demonstration itself by {missed:.2g} of its size")
+        return best, tuple(notes)
+
     def _line(self) -> Tensor:
         """Latent points from the encoded start to x*, one for each of the path, (N_POINTS, n)."""
         share = torch.linspace(1, 0, N_POINTS, dtype=self.attractor.dtype, device=self.attractor.device)
@@ -194,7 +274,8 @@ class TubeDS(LatentDS):
     ) -> TubeReport:
         line, frame = self._line(), self.frame()
         across = torch.linalg.svd(frame.axis.unsqueeze(-1))[0][:, 1:].T * TUBE * frame.length
-        tube = torch.cat([line, *(line[::4] + side * offset for offset in across for side in (1, -1))])
+        some = line[:: max(4, self.dim**2 // 16)]
+        tube = torch.cat([line, *(some + side * offset for offset in across for side in (1, -1))])
         missed = torch.linalg.vector_norm(self.diffeomorphism(line).cpu() - torch.from_numpy(path), dim=-1).mean()
         y = self.diffeomorphism(tube)
         step = 1e-6 * shown.size
@@ -223,10 +304,10 @@ class Candidate(NamedTuple):
     line: Array
     """(N, n) the latent points"""
 
-    def refined(self, path: Array) -> Candidate:
+    def refined(self, path: Array, steps: int = 300) -> Candidate:
         weights = np.ones(len(path))
         weights[[0, -1]] = 0.05 * len(path)  # the start must encode to the start, the goal to the goal
-        return self._replace(layers=refine(self.layers, self.line, path, 0.95, weights=weights))
+        return self._replace(layers=refine(self.layers, self.line, path, 0.95, weights=weights, steps=steps))
 
     def placed(self, origin: Array, unit: float) -> Candidate:
         """The same match in other units, about another origin."""
@@ -235,7 +316,10 @@ class Candidate(NamedTuple):
         return self._replace(layers=layers, line=origin + unit * self.line)
 
     def mse(self, path: Array) -> float:
-        return float(np.square(apply_layers(self.layers, self.line) - path).mean())
+        line = self.line
+        if len(line) != len(path):  # matched on points that crowd where strands are close
+            line = line[:1] + np.linspace(0, 1, len(path))[:, None] * (line[-1] - line[0])
+        return float(np.square(apply_layers(self.layers, line) - path).mean())
 
 
 def _candidates(path: Array, n_layers: int, homotopy: str) -> Iterator[Candidate]:
@@ -256,6 +340,47 @@ def _candidates(path: Array, n_layers: int, homotopy: str) -> Iterator[Candidate
             curves = curvature_homotopy(path, min(steps, most))
             for width in widths:
                 yield matched("unbending", curves, width)
+
+
+def _deeper(path: Array, dense: Array, homotopy: str) -> Iterator[Candidate]:
+    """Matches for a path that those of ``DEPTHS[0]`` layers do not follow, the quickest first.
+
+    More layers; then homotopies tracked as closely as strands need, on points that are denser where they are close.
+    """
+    yield from _candidates(path, DEPTHS[1], homotopy)
+    steps = np.linalg.norm(np.diff(dense, axis=0), axis=1)
+    length, apart = float(steps.sum()), float(np.median(steps))
+
+    def tracked(isotopy: str, curves: Array) -> Iterator[Candidate]:
+        for width in TRACKED:
+            layers = track(curves, DEPTHS[2], width * apart)
+            if layers is not None:
+                yield Candidate(isotopy, pin_ends(layers, curves[0], dense, 0.9), curves[0])
+                return
+
+    if homotopy != "curvature":
+        direction, clear = clear_direction(path)
+        for share in (1.0, 0.25) if clear > CLEAR else ():
+            yield from tracked("straight", drawn_homotopy(dense, direction, share * length, FINE))
+    if path.shape[1] > 1 and homotopy != "linear":
+        yield from tracked("unbending", curvature_homotopy(dense, FINE))
+        for pivot in (0.5, 0.0, 1.0):
+            yield from tracked("unbending", zoom_homotopy(dense, FINE, pivot))
+
+
+def _blur(shown: Demonstration) -> str:
+    """What hides the motion in a recording: noise, read off its fourth differences, or steps; "" if little does."""
+    positions = shown.positions.numpy()
+    if len(positions) < 10:
+        return ""
+    noise = float(np.median(np.linalg.norm(np.diff(positions, 4, axis=0), axis=1))) / math.sqrt(70) / shown.size
+    if noise > BLURRED:
+        return f"noise of {noise:.2g} of its size hides the motion"
+    moves = np.abs(np.diff(positions, axis=0))
+    steps = [float(np.median(one[one > 0])) for one in moves.T if 0 < np.count_nonzero(one) < len(one) / 2]
+    if steps and max(steps) > BLURRED * shown.size:
+        return f"recorded in steps of {max(steps) / shown.size:.2g} of its size, which hide the motion between them"
+    return ""
 
 
 def mean_motion(shown: Sequence[Demonstration]) -> tuple[Demonstration, tuple[float, ...]]:
@@ -288,14 +413,7 @@ def _refuse_crossings(path: Array, origin: Array, unit: float) -> None:
     count = len(step)
     first, second = np.triu_indices(count, max(2, count // 50))
     gap = start[first] - start[second]
-    # the closest points of two segments: clamp one, solve for the other, clamp, solve back
-    a, e = (step[first] ** 2).sum(1), (step[second] ** 2).sum(1)
-    b, c, f = (step[first] * step[second]).sum(1), (step[first] * gap).sum(1), (step[second] * gap).sum(1)
-    denominator = a * e - b * b
-    s = np.clip(np.where(denominator > 1e-12 * a * e, (b * f - c * e) / np.maximum(denominator, 1e-300), 0.0), 0, 1)
-    t = np.clip((b * s + f) / np.maximum(e, 1e-300), 0, 1)
-    s = np.clip((b * t - c) / np.maximum(a, 1e-300), 0, 1)
-    near = np.linalg.norm(gap + s[:, None] * step[first] - t[:, None] * step[second], axis=1)
+    near = segment_distances(gap, step[first], step[second])
     worst = int(np.argmin(near))
     if near[worst] < 1e-7 * np.ptp(path, axis=0).max():
         where = f"[{', '.join(f'{value:.4g}' for value in origin + unit * start[first[worst]])}]"

@@ -158,7 +158,7 @@ def test_a_coordinate_at_rest_works(method):
 @pytest.mark.parametrize(
     ("argument", "values"),
     [
-        ("n_layers", [0, -1, 1.5, True, "many", None]),
+        ("n_layers", [0, -1, 1.5, True, "many"]),
         ("beta", [0, -0.1, 1.001, math.nan, math.inf, "half", None]),
         ("mu", [0, 1, 1.5, -1, math.nan, "most", None]),
     ],
@@ -244,3 +244,19 @@ def test_no_layer_is_narrower_than_asked(narrowest):
     bound = match_along(linear_homotopy(x, y, 2), 30, 0.5, 0.9, narrowest)
     assert (1 / free.widths).min() < narrowest  # else the bound would not be felt
     assert (1 / bound.widths).min() >= narrowest * (1 - 1e-12)
+
+
+@pytest.mark.parametrize("method", TABLE_I, ids=lambda method: method.__name__)
+def test_no_depth_asked_for_is_the_papers_rule(method):
+    shown = datasets.unstable_spiral(3, 300)
+    ds = method(3, n_layers=None).fit(shown)
+    normalised = ds.fit_report.mse / (shown.size / 2) ** 2
+    assert normalised < 1.1e-5
+    assert 25 <= ds.diffeomorphism.n_layers - PINS <= 100
+    assert "by the paper's rule" in ds.fit_report.notes[0]
+    fresh = method(3, n_layers=None)
+    fresh.load_state_dict(ds.state_dict())
+    assert torch.equal(fresh.start, ds.start)
+    assert torch.equal(fresh(shown.positions), ds(shown.positions))
+    with pytest.raises(ValueError, match="n_layers: expected a number beside beta"):
+        method(3, n_layers=None, beta=0.7)

@@ -425,3 +425,46 @@ def test_refinement_pays():
     plain, better = (TubeDS(3, n_layers=60, refined=refined).fit(shown) for refined in (False, True))
     scores = [dtw(rolled(ds, shown), shown.positions) for ds in (plain, better)]
     assert scores[1] < 0.7 * scores[0]
+
+
+# --- the depth that follows from the motion ---------------------------------------------------------------------------
+
+
+def planar_spiral(turns, count=600):
+    way = np.linspace(1, 0.05, count)
+    angle = 2 * np.pi * turns * way
+    return Demonstration(way[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1), 0.01)
+
+
+def follows(ds, shown):
+    return dtw(rolled(ds, shown), shown.positions) / len(shown) < 0.005 * shown.size
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("turns", [1.5, 3])
+def test_a_planar_spiral_takes_as_many_layers_as_it_needs(turns):
+    shown = planar_spiral(turns)
+    ds = TubeDS(2).fit(shown)
+    assert ds.n_layers is None
+    assert ds.fit_report.n_layers == ds.diffeomorphism.n_layers > 300
+    assert follows(ds, shown)
+
+
+@pytest.mark.slow
+def test_strands_a_hair_apart_are_tracked():
+    t = np.linspace(0.1, 0.1 + 2 * np.pi * 0.97, 600)
+    shown = Demonstration(np.stack([np.cos(t), np.sin(2 * t), 1e-3 * np.sin(t)], 1), 0.01)
+    ds = TubeDS(3).fit(shown)
+    assert follows(ds, shown)
+    assert ds.fit_report.fidelity.follows
+
+
+def test_an_easy_motion_takes_300_layers_and_what_is_asked_for_is_kept(tmp_path):
+    shown = motion(lambda t: t)
+    chosen, forced = (TubeDS(2, refined=False, **more).fit(shown) for more in ({}, {"n_layers": 300}))
+    assert torch.equal(rolled(chosen, shown), rolled(forced, shown))
+    assert chosen.fit_report.n_layers == 300
+    fresh = TubeDS(2, refined=False)
+    fresh.load_state_dict(chosen.state_dict())
+    assert torch.equal(rolled(fresh, shown), rolled(chosen, shown))
+    assert TubeDS(2, n_layers=20, refined=False).fit(shown).diffeomorphism.n_layers == 20
