@@ -204,7 +204,9 @@ def first_gradients(call, psi, x, t):
 
 
 @pytest.mark.parametrize("call", CALLS)
-@pytest.mark.parametrize("dim", [1, 2, 3, 7])
+@pytest.mark.parametrize(
+    "dim", [1, pytest.param(2, marks=pytest.mark.slow), 3, pytest.param(7, marks=pytest.mark.slow)]
+)
 def test_adjoint_kernels_give_the_gradients_of_the_torch_path(call, dim):
     psi, x, t = random_map(dim), random_points(77, dim), random_points(77, dim, seed=2)
     for learned, moved in ((True, True), (True, False), (False, True)):
