@@ -17,7 +17,7 @@ from latentds.testing import wavy_motion
 from latentds.time_law import PiecewiseLinearLaw
 
 
-@pytest.mark.parametrize("dim", [1, 2, 7])
+@pytest.mark.parametrize("dim", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(7, marks=pytest.mark.slow)])
 def test_sound_methods_are_not_falsified(fitted, method, dim):
     ds = fitted(method, dim)
     certificate = certify(ds, n_samples=200)
@@ -415,6 +415,7 @@ def test_demonstrations_of_another_dimension_are_refused(fitted):
         certify(ds)
 
 
+@pytest.mark.slow
 def test_floats_can_falsify_what_the_proof_promises():
     """Couplings are invertible whatever their parameters, on paper; here exp overflows what a float holds."""
     ds = SDSEF(2, n_layers=4, n_features=10, seed=0)

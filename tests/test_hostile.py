@@ -44,7 +44,8 @@ def test_harmless_demonstrations_are_fitted(name):
         assert outcome(PLAIN._replace(method=name, dim=dim)) == FOLLOWS
 
 
-@pytest.mark.parametrize("name", FITTED)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("form", ["float32", "float16", "strided", "transposed", "requires_grad", "numpy", "list"])
 def test_every_form_is_taken(name, form):
     assert outcome(PLAIN._replace(method=name, form=form)) == FOLLOWS

@@ -250,7 +250,7 @@ class Descent(StableDS):
     [
         ({}, 1, [False, True]),
         pytest.param({}, 7, [True], marks=pytest.mark.slow),
-        ({"bent": True}, 3, [True]),
+        pytest.param({"bent": True}, 3, [True], marks=pytest.mark.slow),
         pytest.param({"fastest": 100.0}, 2, [True], marks=pytest.mark.slow),
     ],
     ids=["linear, 1-D", "linear, 7-D", "bent", "stiff"],

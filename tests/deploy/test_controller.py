@@ -187,7 +187,9 @@ def autograd(ds, y):
     return torch.func.vmap(torch.func.jacrev(ds))(torch.from_numpy(y)).detach().numpy()
 
 
-@pytest.mark.parametrize("dim", [1, 2, 3, 7])
+@pytest.mark.parametrize(
+    "dim", [pytest.param(1, marks=pytest.mark.slow), 2, 3, pytest.param(7, marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("make", (COMPILED | OTHER).values(), ids=(COMPILED | OTHER).keys())
 def test_jacobian_is_that_of_the_system(make, dim):
     ds, shown = fitted(make, dim)
