@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from . import files, recordings
+from . import files, readers, recordings
 from .arguments import point_array, positive, real_array
 
 logger = logging.getLogger(__name__)
@@ -173,7 +173,7 @@ class Demonstration:
             FileNotFoundError: if there is no such file.
         """
         path = Path(path)
-        table = recordings.read_table(path)
+        table = readers.read_table(path)
         if name is None:
             saved = table.get("name", np.array(0))
             name = str(saved) if saved.ndim == 0 and saved.dtype.kind == "U" else path.stem
@@ -192,7 +192,7 @@ class Demonstration:
         name: str = "",
     ) -> Demonstration:
         """What :meth:`load` does, for a pandas frame or a mapping from names to arrays that is at hand already."""
-        known = recordings.as_table(table)
+        known = readers.as_table(table)
         motion = recordings.understand(known, name or "the table", columns=columns, time=time, unit=unit, dt=dt)
         return cls._of(motion, name)
 
