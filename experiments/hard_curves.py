@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from experiments import report
 from latentds import Demonstration, FitWarning, TubeDS, datasets, metrics
+from latentds.demonstration import arc_lengths
 from latentds.methods.tube import TubeReport
 
 Array = NDArray[np.float64]
@@ -144,7 +145,7 @@ def _spoiled(draw: np.random.Generator) -> Iterator[tuple[str, Array, Array]]:
 
 
 def _even_way(path: Array) -> Array:
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    arc = arc_lengths(path)
     return np.stack([np.interp(np.linspace(0, arc[-1], len(path)), arc, column) for column in path.T], axis=1)
 
 

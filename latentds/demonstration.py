@@ -235,6 +235,12 @@ def demonstrations_of(demonstration: Any, dim: int) -> list[Demonstration]:
     return list(found)
 
 
+def arc_lengths(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Length of the polygon through points (N, n) up to each of them, from 0: (N,)."""
+    lengths: NDArray[np.float64] = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(lengths)])
+
+
 def jitter(positions: NDArray[np.float64]) -> float:
     """Length of the noise in a recording (N, n), read off its second differences: in the units of the positions."""
     return float(np.median(np.linalg.norm(np.diff(positions, 2, axis=0), axis=1)) / math.sqrt(6))

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from latentds import Demonstration
-from latentds.demonstration import demonstrations_of, only_demonstration
+from latentds.demonstration import arc_lengths, demonstrations_of, only_demonstration
 
 
 @pytest.fixture
@@ -290,3 +290,9 @@ def test_positions_at_any_time():
     shown = Demonstration([[0, 1], [2, 1], [2, 5.0]], 0.5)
     found = shown.at(np.array([[-1, 0.25], [0.5, 9]]))
     np.testing.assert_allclose(found, [[[0, 1], [1, 1]], [[2, 1], [2, 5]]])
+
+
+def test_arc_lengths_are_those_of_the_polygon():
+    points = np.random.default_rng(0).standard_normal((20, 3))
+    expected = [sum(math.dist(points[j], points[j + 1]) for j in range(i)) for i in range(20)]
+    np.testing.assert_allclose(arc_lengths(points), expected, rtol=1e-14)
