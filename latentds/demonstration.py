@@ -241,9 +241,14 @@ def arc_lengths(positions: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([[0.0], np.cumsum(lengths)])
 
 
-def jitter(positions: NDArray[np.float64]) -> float:
-    """Length of the noise in a recording (N, n), read off its second differences: in the units of the positions."""
-    return float(np.median(np.linalg.norm(np.diff(positions, 2, axis=0), axis=1)) / math.sqrt(6))
+def jitter(positions: NDArray[np.float64], order: int = 2) -> float:
+    """Length of the noise in a recording (N, n), in the units of the positions.
+
+    Read off its differences of that order k, N > k, in which a motion like a polynomial of a lower degree does not
+    show: those of white noise of standard deviation s have s √C(2k, k).
+    """
+    differences = np.linalg.norm(np.diff(positions, order, axis=0), axis=1)
+    return float(np.median(differences)) / math.sqrt(math.comb(2 * order, order))
 
 
 def goal_apart(shown: Demonstration, goal: Tensor) -> float:
