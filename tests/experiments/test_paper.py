@@ -14,11 +14,12 @@ from experiments.paper import latent_space, tuning, verdicts
 from experiments.paper.__main__ import main, reproduce
 from experiments.paper.held_out import HeldOut
 from experiments.paper.plan import Plan
-from experiments.paper.tuning import Choice, Grid, Tried, choose
+from experiments.paper.tuning import Grid
 from experiments.paper.variants import Variant
 from experiments.published import Setting
 from latentds import benchmark, datasets
 from latentds.fitting.embedding import chebyshev_eigenvalues
+from latentds.fitting.tuning import Choice, Tried, choose
 
 SMALL = Grid(betas=(0.3, 0.9), mus=(0.6, 0.9), n_layers=(5, 10, 75), n_more=1)
 
