@@ -251,7 +251,5 @@ def test_names_of_coordinates_change_no_number():
 
 def test_demonstrations_of_other_columns_are_not_fitted_together():
     swapped = replace(NAMED, columns=("elbow", "shoulder"))
-    with pytest.raises(
-        ValueError, match=r"^demonstration: expected the same columns in all, got"
-    ):
+    with pytest.raises(ValueError, match=r"^demonstration: expected the same columns in all, got"):
         TubeDS(2).fit([NAMED, swapped])
