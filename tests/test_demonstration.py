@@ -163,6 +163,8 @@ def test_names_of_the_coordinates(shown):
     for columns in (["height"], "hf!", 3):
         with pytest.raises(ValueError, match="columns: expected 2 names"):
             Demonstration(shown.positions, shown.dt, columns=columns)
+    with pytest.raises(ValueError, match="columns: expected names that differ"):
+        Demonstration(shown.positions, shown.dt, columns=["height", "height"])
 
 
 def test_npz_with_times(tmp_path):
