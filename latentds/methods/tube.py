@@ -60,7 +60,7 @@ N_POINTS = 600
 """Points, even in arc length, that ψ is matched on."""
 LINEAR = ((20, 1.0), (20, 2.0), (20, 4.0), (5, 2.0), (5, 4.0))
 """Matches tried along the linear homotopy: steps, and length of the latent line in distances from start to goal."""
-CURVATURE = ((20, (1.5, 6.0, 12.0, 40.0)), (5, (1.5, 6.0)))
+CURVATURE = ((20, (1.5, 6.0, 12.0)), (5, (1.5, 6.0)))
 """And along the curvature homotopy: steps, and least widths 1/ρ of a layer in distances between points of the path."""
 WIDTH = 3.0
 """That of a layer along the linear one: narrower layers fit the path better, and what lies beside it worse."""
@@ -76,8 +76,14 @@ ROWS = 120
 """Points, even in time, of the rollouts that judge a match."""
 MAX_CONDITION = 100.0
 """cond(J) along the path above which a match is judged by all of it, below by its root."""
-FIRST_STEPS, TRIES, STEPS = 60, 3, 300
-"""Every match is refined by so many steps; so many of the best by so many more."""
+TRIES, CLOSE = 3, 1.3
+"""So many matches are refined if they score within this factor of the best, …"""
+GOOD_SCORE = 0.06
+"""… and further ones until one scores less than this, or three times this after so many."""
+HOPELESS = 1.0
+"""Where the best of so many scores more than this, and the depth is not given, more layers are the next to be tried."""
+FIRST_STEPS, STEPS = 60, 300
+"""L-BFGS steps of a match with what lies beside the path: of every match, and of those that are refined."""
 BESIDE = 2.0
 """What the distance of ψ's tube from the one around the path counts beside that of the motions that judge a match."""
 FAR = 0.25
@@ -116,19 +122,19 @@ class TubeDS(LatentDS):
 
     Points evenly spaced in arc length are matched to a straight line, so that ψ is near-isometric along the path; the
     timing lives in the time law alone. Matching follows the linear or the curvature homotopy, whichever rolls out
-    better and is better conditioned, and is then refined jointly, with what lies beside the path as far as that leaves
-    room, so that ψ is near-isometric across it too. Across the path the latent point is drawn in at rate κ. The
-    attractor is exact.
+    better and is better conditioned, and is then refined jointly. Across the path the latent point is drawn in at
+    rate κ. The attractor is exact.
 
     Several demonstrations of one motion are fitted by their mean path and timing at equal progress, with a common goal.
+    What lies beside that path is then matched too, as far as it leaves room, so that ψ is near-isometric across it.
 
     Args:
         dim: n >= 1.
         n_layers: M >= 1; None for 300, or as many as it takes to follow the path: see ``DEPTHS``.
         contraction: κ > 0, per duration of the demonstration: a start off the path comes back within about
             3/κ of it. A larger κ costs proportionally larger velocity gradients (see the report). None, the default,
-            reads it from how the offsets of several demonstrations die and from how the path turns: between 1 and 20,
-            2 to 7 on handwriting, 20 on a path that winds; ``fit_report.contraction`` tells it.
+            is 20 for one demonstration, which says nothing about what lies beside it, and for several reads it from
+            how their offsets die and how the path turns: between 1 and 20. ``fit_report.contraction`` tells it.
         refined: whether L-BFGS refines the match; without it a fit takes a tenth of the time.
         homotopy: the one that matching may follow, "linear" or "curvature" (n >= 2), or "both".
     """
@@ -166,20 +172,27 @@ class TubeDS(LatentDS):
         shape = Demonstration(((shown.positions - shown.goal) / unit).round(decimals=DECIMALS), shown.dt)
         path, way, times = arc_length_path(shape.positions.numpy(), shape.times.numpy(), N_POINTS)
         _refuse_crossings(path, origin, unit)
-        kappa = self.contraction
+        kappa, several = self.contraction, len(every) > 1
         if kappa is None:
+            arrival = np.interp(np.linspace(0, 1, N_POINTS), 1 - way, times / times[-1])
             beside = (strands - shown.goal.numpy()) / unit
-            kappa = contraction_of(path, np.interp(np.linspace(0, 1, N_POINTS), 1 - way, times / times[-1]), beside)
+            kappa = contraction_of(path, arrival, beside) if several else JUDGED
         with restore_on_failure(self, shown):
             law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
             judged = []
             for candidate in _candidates(path, self.n_layers or DEPTHS[0], self.homotopy):
-                tried = candidate.widened(path, FIRST_STEPS) if self.refined else candidate
-                judged.append((self._score(tried, path, shape, law), tried))
+                tube = candidate.widened(path, FIRST_STEPS) if several and self.refined else candidate
+                judged.append((self._score(tube, path, shape, law, several), tube))
             judged.sort(key=lambda pair: pair[0])
-            for _, candidate in judged[:TRIES] if self.refined else ():
-                better = candidate.widened(path, STEPS)
-                judged.append((self._score(better, path, shape, law), better))
+            if self.refined:
+                for tried, (score, candidate) in enumerate(list(judged)):
+                    close = tried < TRIES and score < CLOSE * judged[0][0]
+                    enough = min(score for score, _ in judged) < GOOD_SCORE * (1 if tried < TRIES else 3)
+                    hopeless = self.n_layers is None and tried >= TRIES and min(score for score, _ in judged) > HOPELESS
+                    if tried and (enough or hopeless) and not close:
+                        break
+                    better = candidate.widened(path, STEPS) if several else candidate.refined(path)
+                    judged.append((self._score(better, path, shape, law, several), better))
             found = min(judged, key=lambda pair: pair[0])[1]
             notes: tuple[str, ...] = ()
             if self.n_layers is None:
@@ -204,9 +217,13 @@ class TubeDS(LatentDS):
         self.dynamics.transverse_law = transverse.to(self.attractor)
 
     @torch.no_grad()
-    def _score(self, candidate: Candidate, path: Array, shown: Demonstration, law: PiecewiseLinearLaw) -> float:
-        """How badly it rolls out from the demonstrated start (thrice) and NEAR it, and lies beside the path, times
-        √cond(J), or more."""
+    def _score(
+        self, candidate: Candidate, path: Array, shown: Demonstration, law: PiecewiseLinearLaw, several: bool
+    ) -> float:
+        """How badly it rolls out from the demonstrated start (thrice) and NEAR it, times √cond(J), or more.
+
+        Where several demonstrations lie beside the path, so does how badly what lies there is matched.
+        """
         self._take(candidate, shown, law)
         around = np.random.default_rng(1).standard_normal((STARTS, self.dim))
         around *= NEAR * shown.size / np.linalg.norm(around, axis=1, keepdims=True)
@@ -221,8 +238,8 @@ class TubeDS(LatentDS):
         clocks = times + step * (ahead - ahead.round())[:, None]
         misses = [dtw(path, motion) / ROWS / shown.size for path, motion in zip(paths, shown.at(clocks), strict=True)]
         condition = float(self.condition_number(self._line()).max())
-        missed = 3 * misses[0] + float(np.mean(misses[1:])) + BESIDE * candidate.beside(path)
-        score = missed * math.sqrt(condition)
+        score = 3 * misses[0] + float(np.mean(misses[1:])) + (BESIDE * candidate.beside(path) if several else 0.0)
+        score *= math.sqrt(condition)
         score *= max(1.0, condition / MAX_CONDITION)
         return score if math.isfinite(score) else math.inf
 

@@ -1,0 +1,78 @@
+"""What lies beside a path: frames, room for a tube, and how offsets die."""
+
+import numpy as np
+import pytest
+
+from latentds.fitting.bundle import across_of, bundle, contraction_of, directions_along, frames, radius
+
+rng = np.random.default_rng
+
+
+def straight(dim, count=200):
+    return np.linspace(1, 0, count)[:, None] * rng(dim).standard_normal(dim)
+
+
+def arc(angle, dim=2, count=600):
+    """A circular arc of radius 1 from (0, 1) on, in the first two coordinates."""
+    turned = np.linspace(0, angle, count)
+    return np.stack([np.sin(turned), np.cos(turned), *np.zeros((dim - 2, count))], axis=1)
+
+
+@pytest.mark.parametrize("dim", [2, 3, 7])
+def test_frames_are_right_handed_and_across(dim):
+    path = np.cumsum(np.cumsum(rng(0).standard_normal((300, dim)), axis=0) + 40, axis=0)
+    found = np.concatenate([directions_along(path)[:, :, None], frames(path)], axis=2)
+    np.testing.assert_allclose(np.swapaxes(found, 1, 2) @ found, np.broadcast_to(np.eye(dim), found.shape), atol=1e-10)
+    np.testing.assert_allclose(np.linalg.det(found), 1, atol=1e-9)
+
+
+def test_frames_turn_no_more_than_the_path():
+    flat = frames(arc(3.0, 3))
+    assert np.ptp(flat[:, 2], axis=0).max() < 1e-12  # what stands upright on a flat curve stays upright
+    assert np.ptp(frames(straight(5)), axis=0).max() < 1e-12
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 7])
+def test_a_straight_path_is_its_own_tube(dim):
+    path = straight(dim)
+    axis = path[-1] - path[0]
+    pairs = bundle(path, path, across_of(axis / np.linalg.norm(axis)))
+    np.testing.assert_allclose(pairs.x, pairs.y, atol=1e-12)
+    assert len(pairs.weights) == len(pairs.x) > len(path)
+    assert (pairs.weights > 0).all()
+
+
+def test_a_tube_keeps_off_other_strands_and_bends_no_further_than_the_path():
+    near = 0.06
+    there = np.stack([np.linspace(0, 1, 300), np.zeros(300)], axis=1)
+    turn = near / 2 * np.stack([np.sin(np.linspace(0, np.pi, 60)), 1 - np.cos(np.linspace(0, np.pi, 60))], axis=1)
+    hairpin = np.concatenate([there, [1, 0] + turn, there[::-1] + [0, near]])
+    assert radius(hairpin, hairpin, 0.2)[[100, 500]].max() < near / 2
+    round_ = arc(2.0)
+    assert radius(round_, round_, 5.0)[100:-100].max() < 1  # of radius 1 itself
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_offsets_matter_less_the_more_a_path_turns(dim):
+    even = np.linspace(0, 1, 600)
+    found = [contraction_of(path, even, path[None]) for path in (arc(0.01, dim), arc(1.5, dim), arc(40.0, dim))]
+    assert 1 < found[0] < found[1] < found[2] <= 20
+    assert found[2] > (19 if dim == 2 else found[1])
+
+
+@pytest.mark.parametrize("kappa", [2.0, 6.0])
+def test_demonstrations_say_how_their_offsets_die(kappa):
+    path, even = arc(0.5), np.linspace(0, 1, 600)
+    dying = np.exp(-kappa * even)[:, None] * frames(path)[:, :, 0]
+    shown = path + np.array([-0.1, 0.05, 0.1])[:, None, None] * dying
+    alone, together = contraction_of(path, even, path[None]), contraction_of(path, even, shown)
+    assert min(kappa, alone) - 0.1 <= together <= max(kappa, alone) + 0.1
+    assert abs(together - kappa) < abs(alone - kappa)
+
+
+def test_units_and_place_do_not_matter():
+    path, even = arc(2.0), np.linspace(0, 1, 600)
+    shown = path + np.array([-0.1, 0.1])[:, None, None] * (1 - even)[:, None]
+    moved = [contraction_of(1000 * path + 7, even, 1000 * shown + 7), contraction_of(path, even, shown)]
+    assert moved[0] == pytest.approx(moved[1])
+    np.testing.assert_allclose(radius(1000 * path, 1000 * path, 200.0), 1000 * radius(path, path, 0.2))
