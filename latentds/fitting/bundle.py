@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
+from scipy.optimize import lsq_linear
 
 from .strands import Strands
 
@@ -28,6 +31,10 @@ LIGHT = 0.3
 """Weight of what lies beside the path: a point there counts as so many of the path."""
 CONTRACTIONS = np.geomspace(1, 20, 200)
 """Rates κ, per duration, among which :func:`contraction_of` finds its own; from 20 on velocity gradients get steep."""
+
+CELLS, FASTEST, TRUST = 60, 10.0, 0.03
+"""Stretches of the way, each with a pace of its own, that :func:`timing_of` tells apart; most speed in mean speeds; and
+what a pace far from the mean costs beside the times that it explains."""
 
 
 class Bundle(NamedTuple):
@@ -177,3 +184,37 @@ def contraction_of(path: Array, times: Array, shown: Array) -> float:
         left = (left + np.clip((offsets * first).sum((0, 2)) / total, 0, 1)) / 2
     misses = ((np.exp(-CONTRACTIONS[:, None] * times) - left) ** 2).sum(1)
     return float(CONTRACTIONS[int(np.argmin(misses))])
+
+
+def timing_of(progress: Array, times: Array) -> tuple[Array, Array]:
+    """When a motion passes where, such that each of several, from where it starts, keeps its own times most nearly.
+
+    Those that start behind the mean must not wait where the others stood at rest, and none may be slow where only
+    others were. The seconds that a stretch takes are found by least squares, which is a bounded linear problem.
+
+    Args:
+        progress: (K, N) where demonstrations are, 1 at the mean start and 0 at the goal.
+        times: (K, N) when, in seconds.
+
+    Returns:
+        Progress, falling from the hindmost start to 0, and seconds, rising from 0, both (m,).
+    """
+    passed = np.minimum.accumulate(np.maximum(progress, 0), axis=1)
+    edges = np.linspace(0, max(1.0, float(passed[:, 0].max())), CELLS + 1)
+    width, low, high = edges[1], edges[:-1], edges[1:]
+    some = np.linspace(0, passed.shape[1] - 1, CELLS + 1).round().astype(int)[1:]
+    starts, there = passed[:, :1, None], passed[:, some, None]
+    spent = (np.clip(starts, low, high) - np.clip(there, low, high)).reshape(-1, CELLS)
+    mean = np.interp(-edges, -passed.mean(0), times.mean(0))
+    usual = np.maximum(-np.diff(mean), 1e-3 * mean[0]) / width
+    trust = TRUST * width * math.sqrt(CELLS) * np.eye(CELLS)
+    share = 1 / math.sqrt(len(spent))
+    duration = float(times[:, -1].mean())
+    pace = lsq_linear(
+        np.concatenate([share * spent, trust]),
+        np.concatenate([share * times[:, some].reshape(-1), trust @ usual]),
+        bounds=(duration / FASTEST, np.inf),
+    ).x
+    arrivals = np.concatenate([[0.0], np.cumsum(width * pace[::-1])])
+    way = np.linspace(edges[-1], 0, 10 * CELLS + 1)
+    return way, PchipInterpolator(edges[-1] - edges[::-1], arrivals)(edges[-1] - way)

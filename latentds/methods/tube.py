@@ -19,7 +19,7 @@ from ..demonstration import Demonstration, demonstrations_of, jitter
 from ..diffeomorphism import Layers, LocallyWeightedTranslations
 from ..dynamics import TubeDynamics
 from ..fidelity import Excerpt, measure
-from ..fitting.bundle import across_of, bundle, contraction_of, frames, smoothed
+from ..fitting.bundle import across_of, bundle, contraction_of, frames, smoothed, timing_of
 from ..fitting.embedding import arc_length_path, map_to_endpoints, straight_column
 from ..fitting.homotopy import (
     clear_direction,
@@ -166,7 +166,7 @@ class TubeDS(LatentDS):
     def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> TubeDS:
         began = time.perf_counter()
         every = demonstrations_of(demonstration, self.dim)
-        shown, strands = mean_motion(every)
+        shown, strands, arrivals = mean_motion(every)
         # L-BFGS runs on to another match from another rounding, so that none may come from the units or the origin.
         origin, unit = shown.goal.numpy(), shown.size
         shape = Demonstration(((shown.positions - shown.goal) / unit).round(decimals=DECIMALS), shown.dt)
@@ -199,6 +199,8 @@ class TubeDS(LatentDS):
                 found, notes = self._followed(found, path, shape, law)
             best = found.placed(origin, unit)
             self._take(best, shown, law, kappa)
+            if several:
+                self._take(best, shown, self._timed(strands, arrivals), kappa)
             report = self._report(best, origin + unit * path, shown, began)
             spread = tuple(float(value) for value in strands.std(0).mean(0))
             report = replace(report, notes=notes, spread=spread, contraction=kappa)
@@ -215,6 +217,13 @@ class TubeDS(LatentDS):
         self.dynamics.law = law.to(self.attractor)
         transverse = PiecewiseLinearLaw(far.reshape(1), (far * kappa / shown.duration).reshape(1))
         self.dynamics.transverse_law = transverse.to(self.attractor)
+
+    @torch.no_grad()
+    def _timed(self, strands: Array, arrivals: Array) -> PiecewiseLinearLaw:
+        """The time law under which motions (K, N, n) from their own starts keep their times (K, N) most nearly."""
+        progress = self.dynamics.phase(self.encode(torch.from_numpy(strands).to(self.attractor)), self.frame())
+        way, times = timing_of(progress.cpu().double().numpy(), arrivals)
+        return PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
 
     @torch.no_grad()
     def _score(
@@ -436,10 +445,10 @@ def _blur(shown: Demonstration) -> str:
     return ""
 
 
-def mean_motion(shown: Sequence[Demonstration]) -> tuple[Demonstration, Array]:
-    """The mean of several demonstrations at equal progress, with the mean goal; and each at even progress, (K, N, n).
+def mean_motion(shown: Sequence[Demonstration]) -> tuple[Demonstration, Array, Array]:
+    """The mean of several demonstrations at equal progress, with the mean goal; each at even progress; and when.
 
-    Each is moved onto the common goal, the more the farther along it is.
+    Each, (K, N, n), is moved onto the common goal, the more the farther along it is; its times are (K, N), in seconds.
     """
     goal = np.mean([one.goal.numpy() for one in shown], axis=0)
     paths, arrivals, even = [], [], np.linspace(0, 1, N_POINTS)
@@ -449,11 +458,15 @@ def mean_motion(shown: Sequence[Demonstration]) -> tuple[Demonstration, Array]:
         arrivals.append(np.interp(even, 1 - way, times))
     strands = np.stack(paths)
     if len(shown) == 1:
-        return shown[0], strands
+        return shown[0], strands, np.stack(arrivals)
     count, arrival = max(len(one) for one in shown), np.mean(arrivals, axis=0)
     at = np.interp(np.linspace(0, arrival[-1], count), arrival, even)
     mean = np.stack([np.interp(at, even, column) for column in strands.mean(0).T], axis=1)
-    return Demonstration(torch.from_numpy(mean), arrival[-1] / (count - 1), f"mean of {len(shown)}"), strands
+    return (
+        Demonstration(torch.from_numpy(mean), arrival[-1] / (count - 1), f"mean of {len(shown)}"),
+        strands,
+        np.stack(arrivals),
+    )
 
 
 def _refuse_crossings(path: Array, origin: Array, unit: float) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from latentds.fitting.bundle import across_of, bundle, contraction_of, directions_along, frames, radius
+from latentds.fitting.bundle import across_of, bundle, contraction_of, directions_along, frames, radius, timing_of
 
 rng = np.random.default_rng
 
@@ -76,3 +76,28 @@ def test_units_and_place_do_not_matter():
     moved = [contraction_of(1000 * path + 7, even, 1000 * shown + 7), contraction_of(path, even, shown)]
     assert moved[0] == pytest.approx(moved[1])
     np.testing.assert_allclose(radius(1000 * path, 1000 * path, 200.0), 1000 * radius(path, path, 0.2))
+
+
+def smooth_fall(start, count=400):
+    """From ``start`` at rest to 0 at rest, evenly in time."""
+    t = np.linspace(0, 1, count)
+    return start * (1 - (10 * t**3 - 15 * t**4 + 6 * t**5))
+
+
+def test_equal_motions_keep_their_timing():
+    times = np.linspace(0, 3, 400)
+    way, found = timing_of(np.stack([smooth_fall(1.0)] * 2), np.stack([times] * 2))
+    assert found[0] == 0 and way[0] == 1 and way[-1] == 0
+    assert (np.diff(found) > 0).all() and (np.diff(way) < 0).all()
+    assert abs(np.interp(times, found, way) - smooth_fall(1.0)).max() < 0.02
+
+
+def test_who_starts_behind_does_not_wait_where_others_stood():
+    starts, times = (1.25, 1.0, 0.8), np.linspace(0, 3, 400)
+    progress = np.stack([smooth_fall(start) for start in starts])
+    way, found = timing_of(progress, np.stack([times] * 3))
+    takes = found[-1] - np.interp(-np.array(starts), -way, found)
+    assert takes[0] < 3.3  # at the mean speed before the others' start, and at rest there, it would be 3.7
+    assert abs(takes - 3).max() < 0.45
+    slow = timing_of(progress, np.stack([1000 * times] * 3))
+    np.testing.assert_allclose(slow[1], 1000 * found, rtol=1e-9)

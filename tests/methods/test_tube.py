@@ -337,11 +337,11 @@ def test_several_agree_on_a_goal_and_report_their_spread():
 
 def test_mean_of_equal_ones_is_each_of_them():
     shown = family()[0]
-    mean, strands = mean_motion([shown] * 3)
+    mean, strands, _ = mean_motion([shown] * 3)
     torch.testing.assert_close(mean.positions, shown.positions, rtol=0, atol=1e-3)
     assert mean.dt == pytest.approx(shown.dt)
     assert strands.std(0).max() < 1e-12
-    alone, strands = mean_motion([shown])
+    alone, strands, _ = mean_motion([shown])
     assert alone == shown
     assert len(strands) == 1
 
