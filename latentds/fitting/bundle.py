@@ -123,7 +123,8 @@ def radius(path: Array, smooth: Array, wanted: float) -> Array:
     most = np.minimum(ROOM * clearance, BEND / np.maximum(bends, 1e-12 / wanted))
     near = max(1, len(path) // 60)
     most = gaussian_filter1d(minimum_filter1d(most, 2 * near + 1), near, mode="nearest")
-    return np.minimum(np.clip(most, THIN * wanted, wanted), ROOM * clearance)
+    found: Array = np.minimum(np.clip(most, THIN * wanted, wanted), ROOM * clearance)
+    return found
 
 
 def directions_along(path: Array) -> Array:
@@ -214,6 +215,7 @@ def timing_of(progress: Array, times: Array) -> tuple[Array, Array]:
         np.concatenate([share * spent, trust]),
         np.concatenate([share * times[:, some].reshape(-1), trust @ usual]),
         bounds=(duration / FASTEST, np.inf),
+        method="bvls",  # exact, so that the unit of time makes no difference
     ).x
     arrivals = np.concatenate([[0.0], np.cumsum(width * pace[::-1])])
     way = np.linspace(edges[-1], 0, 10 * CELLS + 1)

@@ -46,7 +46,7 @@ def test_a_tube_keeps_off_other_strands_and_bends_no_further_than_the_path():
     near = 0.06
     there = np.stack([np.linspace(0, 1, 300), np.zeros(300)], axis=1)
     turn = near / 2 * np.stack([np.sin(np.linspace(0, np.pi, 60)), 1 - np.cos(np.linspace(0, np.pi, 60))], axis=1)
-    hairpin = np.concatenate([there, [1, 0] + turn, there[::-1] + [0, near]])
+    hairpin = np.concatenate([there, turn + np.array([1, 0]), there[::-1] + np.array([0, near])])
     assert radius(hairpin, hairpin, 0.2)[[100, 500]].max() < near / 2
     round_ = arc(2.0)
     assert radius(round_, round_, 5.0)[100:-100].max() < 1  # of radius 1 itself
@@ -87,8 +87,11 @@ def smooth_fall(start, count=400):
 def test_equal_motions_keep_their_timing():
     times = np.linspace(0, 3, 400)
     way, found = timing_of(np.stack([smooth_fall(1.0)] * 2), np.stack([times] * 2))
-    assert found[0] == 0 and way[0] == 1 and way[-1] == 0
-    assert (np.diff(found) > 0).all() and (np.diff(way) < 0).all()
+    assert found[0] == 0
+    assert way[0] == 1
+    assert way[-1] == 0
+    assert (np.diff(found) > 0).all()
+    assert (np.diff(way) < 0).all()
     assert abs(np.interp(times, found, way) - smooth_fall(1.0)).max() < 0.02
 
 
