@@ -29,9 +29,6 @@ EXTENDED = 0.15, 0.05
 """How far the path is carried on straight before its start and beyond its goal, in sizes, where there is room."""
 LIGHT = 0.3
 """Weight of what lies beside the path: a point there counts as so many of the path."""
-CONTRACTIONS = np.geomspace(1, 20, 200)
-"""Rates κ, per duration, among which :func:`contraction_of` finds its own; from 20 on velocity gradients get steep."""
-
 CELLS, FASTEST, TRUST = 60, 10.0, 0.03
 """Stretches of the way, each with a pace of its own, that :func:`timing_of` tells apart; most speed in mean speeds; and
 what a pace far from the mean costs beside the times that it explains."""
@@ -156,35 +153,6 @@ def across_of(direction: Array) -> Array:
     if len(direction) > 1 and np.linalg.det(basis) < 0:
         basis[:, -1] *= -1
     return basis[:, 1:]
-
-
-def contraction_of(path: Array, times: Array, shown: Array) -> float:
-    """The rate κ, per duration, at which offsets from a path should die.
-
-    Somebody who starts beside a motion draws the same motion elsewhere, and ends at the same goal: the offset stays
-    parallel and dies linearly. A tube turns it with the path, so that it is worth what of it still points across, and
-    nothing once the path has turned by a right angle. Several demonstrations say themselves, on an equal footing with
-    this. κ is the rate whose exponential is nearest to that, in the mean square along the path.
-
-    Args:
-        path: (N, n) evenly spaced.
-        times: (N,) when the motion is there, as shares of the duration.
-        shown: (K, N, n) demonstrations at the same progress.
-    """
-    dim = path.shape[1]
-    if dim == 1:
-        return float(CONTRACTIONS[-1])
-    smooth = smoothed(path)
-    directions = directions_along(smooth)
-    parallel = np.minimum.accumulate(np.clip(directions @ directions[0], 0, 1))
-    left = np.linspace(1, 0, len(path)) * np.sqrt((dim - 2 + parallel) / (dim - 1))
-    offsets = np.einsum("kin,ina->kia", shown - path, frames(smooth))
-    first = offsets[:, : len(path) // 20].mean(1, keepdims=True)
-    total = float((first**2).sum())
-    if len(shown) > 1 and total > 0:
-        left = (left + np.clip((offsets * first).sum((0, 2)) / total, 0, 1)) / 2
-    misses = ((np.exp(-CONTRACTIONS[:, None] * times) - left) ** 2).sum(1)
-    return float(CONTRACTIONS[int(np.argmin(misses))])
 
 
 def timing_of(progress: Array, times: Array) -> tuple[Array, Array]:

@@ -19,7 +19,7 @@ from ..demonstration import Demonstration, demonstrations_of, jitter
 from ..diffeomorphism import Layers, LocallyWeightedTranslations
 from ..dynamics import TubeDynamics
 from ..fidelity import Excerpt, measure
-from ..fitting.bundle import across_of, bundle, contraction_of, frames, smoothed, timing_of
+from ..fitting.bundle import across_of, bundle, frames, smoothed, timing_of
 from ..fitting.embedding import arc_length_path, map_to_endpoints, straight_column
 from ..fitting.homotopy import (
     clear_direction,
@@ -68,6 +68,8 @@ DECIMALS = 9
 """To which the motion is rounded, in its own sizes."""
 TUBE = 0.02
 """Radius of the tube that the report speaks of, in lengths of the latent line."""
+CONTRACTIONS = tuple(float(kappa) for kappa in np.geomspace(1, 20, 6))
+"""Rates κ, per duration, among which one is chosen for several demonstrations."""
 JUDGED = 20.0
 """κ under which matches are judged: they lead back to the path or they do not, whatever pull the motion is given."""
 NEAR, STARTS = 0.05, 32
@@ -125,16 +127,18 @@ class TubeDS(LatentDS):
     better and is better conditioned, and is then refined jointly. Across the path the latent point is drawn in at
     rate κ. The attractor is exact.
 
-    Several demonstrations of one motion are fitted by their mean path and timing at equal progress, with a common goal.
-    What lies beside that path is then matched too, as far as it leaves room, so that ψ is near-isometric across it.
+    Several demonstrations of one motion are fitted by their mean path at equal progress, with a common goal, and by the
+    time law under which each, from where it starts, keeps its own times most nearly. What lies beside that path is
+    matched too, as far as it leaves room, so that ψ is near-isometric across it.
 
     Args:
         dim: n >= 1.
         n_layers: M >= 1; None for 300, or as many as it takes to follow the path: see ``DEPTHS``.
         contraction: κ > 0, per duration of the demonstration: a start off the path comes back within about
             3/κ of it. A larger κ costs proportionally larger velocity gradients (see the report). None, the default,
-            is 20 for one demonstration, which says nothing about what lies beside it, and for several reads it from
-            how their offsets die and how the path turns: between 1 and 20. ``fit_report.contraction`` tells it.
+            is 20 for one demonstration, which says nothing about what lies beside it, and for several that one of
+            ``CONTRACTIONS`` under which their own starts lead most nearly along them. ``fit_report.contraction`` tells
+            it.
         refined: whether L-BFGS refines the match; without it a fit takes a tenth of the time.
         homotopy: the one that matching may follow, "linear" or "curvature" (n >= 2), or "both".
     """
@@ -172,11 +176,7 @@ class TubeDS(LatentDS):
         shape = Demonstration(((shown.positions - shown.goal) / unit).round(decimals=DECIMALS), shown.dt)
         path, way, times = arc_length_path(shape.positions.numpy(), shape.times.numpy(), N_POINTS)
         _refuse_crossings(path, origin, unit)
-        kappa, several = self.contraction, len(every) > 1
-        if kappa is None:
-            arrival = np.interp(np.linspace(0, 1, N_POINTS), 1 - way, times / times[-1])
-            beside = (strands - shown.goal.numpy()) / unit
-            kappa = contraction_of(path, arrival, beside) if several else JUDGED
+        several = Several((strands - origin) / unit, arrivals) if len(every) > 1 else None
         with restore_on_failure(self, shown):
             law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
             judged = []
@@ -198,9 +198,10 @@ class TubeDS(LatentDS):
             if self.n_layers is None:
                 found, notes = self._followed(found, path, shape, law)
             best = found.placed(origin, unit)
-            self._take(best, shown, law, kappa)
+            kappa = self.contraction or JUDGED
             if several:
-                self._take(best, shown, self._timed(strands, arrivals), kappa)
+                law, kappa, _ = self._settled(found, shape, law, several)
+            self._take(best, shown, law, kappa)
             report = self._report(best, origin + unit * path, shown, began)
             spread = tuple(float(value) for value in strands.std(0).mean(0))
             report = replace(report, notes=notes, spread=spread, contraction=kappa)
@@ -219,20 +220,34 @@ class TubeDS(LatentDS):
         self.dynamics.transverse_law = transverse.to(self.attractor)
 
     @torch.no_grad()
-    def _timed(self, strands: Array, arrivals: Array) -> PiecewiseLinearLaw:
-        """The time law under which motions (K, N, n) from their own starts keep their times (K, N) most nearly."""
-        progress = self.dynamics.phase(self.encode(torch.from_numpy(strands).to(self.attractor)), self.frame())
-        way, times = timing_of(progress.cpu().double().numpy(), arrivals)
-        return PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
+    def _settled(
+        self, candidate: Candidate, shown: Demonstration, law: PiecewiseLinearLaw, several: Several
+    ) -> tuple[PiecewiseLinearLaw, float, float]:
+        """Time law and κ under which a match leads several from their own starts most nearly along; and how nearly.
+
+        The last is the mean distance in sizes of the motion.
+        """
+        self._take(candidate, shown, law)
+        progress = self.dynamics.phase(self.encode(torch.from_numpy(several.strands).to(self.attractor)), self.frame())
+        way, times = timing_of(progress.cpu().double().numpy(), several.arrivals)
+        law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
+        found = []
+        for kappa in CONTRACTIONS if self.contraction is None else (self.contraction,):
+            self._take(candidate, shown, law, kappa)
+            found.append((several.missed(self), kappa))
+        miss, kappa = min(found)
+        return law, kappa, miss
 
     @torch.no_grad()
     def _score(
-        self, candidate: Candidate, path: Array, shown: Demonstration, law: PiecewiseLinearLaw, several: bool
+        self, candidate: Candidate, path: Array, shown: Demonstration, law: PiecewiseLinearLaw, several: Several | None
     ) -> float:
         """How badly it rolls out from the demonstrated start (thrice) and NEAR it, times √cond(J), or more.
 
-        Where several demonstrations lie beside the path, so does how badly what lies there is matched.
+        Of several demonstrations, how badly their own starts lead along them and how badly what lies beside their mean
+        is matched count, too.
         """
+        told = self._settled(candidate, shown, law, several)[2] if several else 0.0
         self._take(candidate, shown, law)
         around = np.random.default_rng(1).standard_normal((STARTS, self.dim))
         around *= NEAR * shown.size / np.linalg.norm(around, axis=1, keepdims=True)
@@ -247,7 +262,9 @@ class TubeDS(LatentDS):
         clocks = times + step * (ahead - ahead.round())[:, None]
         misses = [dtw(path, motion) / ROWS / shown.size for path, motion in zip(paths, shown.at(clocks), strict=True)]
         condition = float(self.condition_number(self._line()).max())
-        score = 3 * misses[0] + float(np.mean(misses[1:])) + (BESIDE * candidate.beside(path) if several else 0.0)
+        score = (
+            3 * (misses[0] + told) + float(np.mean(misses[1:])) + (BESIDE * candidate.beside(path) if several else 0.0)
+        )
         score *= math.sqrt(condition)
         score *= max(1.0, condition / MAX_CONDITION)
         return score if math.isfinite(score) else math.inf
@@ -325,6 +342,25 @@ class TubeDS(LatentDS):
             largest_velocity=float(torch.linalg.vector_norm(self(y), dim=-1).max()) * shown.duration / length,
             largest_gradient=float(torch.linalg.matrix_norm(slopes, 2).max()) * shown.duration,
         )
+
+
+class Several(NamedTuple):
+    """Several demonstrations, moved onto their common goal."""
+
+    strands: Array
+    """(K, N, n) each at even progress"""
+    arrivals: Array
+    """(K, N) when it is there, in seconds"""
+
+    def missed(self, ds: TubeDS) -> float:
+        """Mean distance of the motions from their starts to them, in units of the strands."""
+        misses = []
+        for strand, arrival in zip(self.strands, self.arrivals, strict=True):
+            times = np.linspace(0, arrival[-1], ROWS)
+            motion = np.stack([np.interp(times, arrival, column) for column in strand.T], axis=1)
+            path = ds.rollout(torch.from_numpy(strand[0]).to(ds.attractor), torch.from_numpy(times)).cpu().numpy()
+            misses.append(dtw(path, motion) / ROWS)
+        return float(np.mean(misses))
 
 
 class Candidate(NamedTuple):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from latentds.fitting.bundle import across_of, bundle, contraction_of, directions_along, frames, radius, timing_of
+from latentds.fitting.bundle import across_of, bundle, directions_along, frames, radius, timing_of
 
 rng = np.random.default_rng
 
@@ -50,32 +50,6 @@ def test_a_tube_keeps_off_other_strands_and_bends_no_further_than_the_path():
     assert radius(hairpin, hairpin, 0.2)[[100, 500]].max() < near / 2
     round_ = arc(2.0)
     assert radius(round_, round_, 5.0)[100:-100].max() < 1  # of radius 1 itself
-
-
-@pytest.mark.parametrize("dim", [2, 3])
-def test_offsets_matter_less_the_more_a_path_turns(dim):
-    even = np.linspace(0, 1, 600)
-    found = [contraction_of(path, even, path[None]) for path in (arc(0.01, dim), arc(1.5, dim), arc(40.0, dim))]
-    assert 1 < found[0] < found[1] < found[2] <= 20
-    assert found[2] > (19 if dim == 2 else found[1])
-
-
-@pytest.mark.parametrize("kappa", [2.0, 6.0])
-def test_demonstrations_say_how_their_offsets_die(kappa):
-    path, even = arc(0.5), np.linspace(0, 1, 600)
-    dying = np.exp(-kappa * even)[:, None] * frames(path)[:, :, 0]
-    shown = path + np.array([-0.1, 0.05, 0.1])[:, None, None] * dying
-    alone, together = contraction_of(path, even, path[None]), contraction_of(path, even, shown)
-    assert min(kappa, alone) - 0.1 <= together <= max(kappa, alone) + 0.1
-    assert abs(together - kappa) < abs(alone - kappa)
-
-
-def test_units_and_place_do_not_matter():
-    path, even = arc(2.0), np.linspace(0, 1, 600)
-    shown = path + np.array([-0.1, 0.1])[:, None, None] * (1 - even)[:, None]
-    moved = [contraction_of(1000 * path + 7, even, 1000 * shown + 7), contraction_of(path, even, shown)]
-    assert moved[0] == pytest.approx(moved[1])
-    np.testing.assert_allclose(radius(1000 * path, 1000 * path, 200.0), 1000 * radius(path, path, 0.2))
 
 
 def smooth_fall(start, count=400):

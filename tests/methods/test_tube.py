@@ -308,12 +308,14 @@ def test_bad_contraction(contraction):
 # --- several demonstrations -------------------------------------------------------------------------------------------
 
 
-def family(count=5, *, end_apart=0.0):
-    """One bend, wider and narrower, from starts in a row; each of another length."""
+def family(count=5, *, end_apart=0.0, power=1):
+    """One bend, wider and narrower, from starts in a row; each of another length. Offsets die as (1 - way)^power."""
     found = []
     for i, wide in enumerate(np.linspace(-1, 1, count)):
         way = np.linspace(0, 1, 300 + 20 * i)
-        bend = np.stack([1 - way, (0.3 + 0.1 * wide) * np.sin(np.pi * way) + 0.15 * wide * (1 - way)], 1)
+        bend = np.stack(
+            [1 - way, (0.3 + 0.1 * wide * (power == 1)) * np.sin(np.pi * way) + 0.15 * wide * (1 - way) ** power], 1
+        )
         found.append(Demonstration(bend + end_apart * np.array([wide, 0]), 0.01, f"{i}"))
     return found
 
@@ -383,10 +385,22 @@ def test_several_make_the_map_near_isometric_across_the_path():
 def test_the_contraction_is_read_unless_it_is_asked_for():
     shown = family()
     read, asked = fast(2).fit(shown), TubeDS(2, refined=False, contraction=9.0).fit(shown)
-    assert 1 < read.fit_report.contraction < 9
+    assert 1 <= read.fit_report.contraction < 9
     assert asked.fit_report.contraction == 9
     assert read.contraction is None
     assert fast(2).fit(shown[0]).fit_report.contraction == 20
+    assert fast(2).fit(family(power=12)).fit_report.contraction > read.fit_report.contraction
+
+
+def test_each_of_several_keeps_its_own_time():
+    shown = family()
+    ds = fast(2).fit(shown)
+    with torch.no_grad():
+        left = ds.dynamics.law.time_to_go(
+            ds.dynamics.phase(ds.encode(torch.stack([d.start for d in shown])), ds.frame())
+        )
+    mean = np.mean([d.duration for d in shown])
+    assert abs(left.mean() - mean) < 0.1 * mean
 
 
 # --- units, types, report ---------------------------------------------------------------------------------------------
