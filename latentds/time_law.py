@@ -125,18 +125,18 @@ class PiecewiseLinearLaw(TimeLaw):
         """The law under which progress falls as shown: a demonstrated time law.
 
         Knots lie where progress and time, both as shares, advance evenly together, so that slow and fast parts are
-        resolved alike; their speeds are settled until the time between any two knots is the demonstrated one. Above 1
-        the speed rises (or falls) to the mean within 2 % of the way, so that a start at rest does not hold up
-        what starts behind it.
+        resolved alike; their speeds are settled until the time between any two knots is the demonstrated one. Before
+        the start the speed rises (or falls) to the mean within 2 % of the way, so that a start at rest does not hold
+        up what starts behind it.
 
         Args:
-            progress: (m,) strictly decreasing from 1 to 0.
+            progress: (m,) strictly decreasing from 1, or from where the hindmost of several motions starts, to 0.
             times: (m,) seconds, strictly increasing from 0.
             n_knots: most knots.
         """
         s, t = progress.to(torch.float64).cpu().numpy(), times.to(torch.float64).cpu().numpy()
-        clock = (1 - s) + t / t[-1]
-        even = np.interp(np.linspace(0, 2, n_knots), clock, s)
+        clock = (s[0] - s) + s[0] * t / t[-1]
+        even = np.interp(np.linspace(0, 2 * s[0], n_knots), clock, s)
         even = even[even > 2 * TAIL]
         apart = np.concatenate([[True], -np.diff(even) > 1e-6])
         knots = np.concatenate([even[apart], [TAIL]])[::-1]
@@ -155,8 +155,8 @@ class PiecewiseLinearLaw(TimeLaw):
             nudge[1:] += excess
             nudge[1:-1] /= 2
             speeds = speeds * np.exp(0.5 * nudge)
-        mean = 1 / t[-1]
-        return cls(torch.from_numpy(np.append(knots, 1.02)), torch.from_numpy(np.append(speeds, mean)))
+        mean = s[0] / t[-1]
+        return cls(torch.from_numpy(np.append(knots, s[0] + 0.02)), torch.from_numpy(np.append(speeds, mean)))
 
     def speed(self, s: Tensor) -> Tensor:
         low, high = self._segment(torch.bucketize(s.detach(), self.knots))

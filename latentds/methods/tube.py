@@ -19,6 +19,7 @@ from ..demonstration import Demonstration, demonstrations_of, jitter
 from ..diffeomorphism import Layers, LocallyWeightedTranslations
 from ..dynamics import TubeDynamics
 from ..fidelity import Excerpt, measure
+from ..fitting.bundle import across_of, bundle, frames, smoothed, timing_of
 from ..fitting.embedding import arc_length_path, map_to_endpoints, straight_column
 from ..fitting.homotopy import (
     clear_direction,
@@ -67,6 +68,10 @@ DECIMALS = 9
 """To which the motion is rounded, in its own sizes."""
 TUBE = 0.02
 """Radius of the tube that the report speaks of, in lengths of the latent line."""
+CONTRACTIONS = tuple(float(kappa) for kappa in np.geomspace(1, 20, 6))
+"""Rates κ, per duration, among which one is chosen for several demonstrations."""
+JUDGED = 20.0
+"""κ under which matches are judged: they lead back to the path or they do not, whatever pull the motion is given."""
 NEAR, STARTS = 0.05, 32
 """Distance from the demonstrated start, in sizes of the motion, and number of the starts that also judge a match."""
 ROWS = 120
@@ -79,6 +84,10 @@ GOOD_SCORE = 0.06
 """… and further ones until one scores less than this, or three times this after so many."""
 HOPELESS = 1.0
 """Where the best of so many scores more than this, and the depth is not given, more layers are the next to be tried."""
+FIRST_STEPS, STEPS = 60, 300
+"""L-BFGS steps of a match with what lies beside the path: of every match, and of those that are refined."""
+BESIDE = 2.0
+"""What the distance of ψ's tube from the one around the path counts beside that of the motions that judge a match."""
 FAR = 0.25
 """Distance from the axis, in sizes of the motion, beyond which the inward pull stops growing."""
 
@@ -97,6 +106,7 @@ class TubeReport(FitReport):
         largest_gradient: largest ‖∂f/∂y‖ (spectral) in that tube, per demonstration duration: what a controller must
             follow; it grows with the contraction κ.
         spread: standard deviation of several demonstrations about their mean path, per coordinate; zeros for one.
+        contraction: κ, per duration of the demonstration: the one asked for, or read from what was shown.
     """
 
     isotopy: str = ""
@@ -106,6 +116,7 @@ class TubeReport(FitReport):
     largest_velocity: float = 0.0
     largest_gradient: float = 0.0
     spread: tuple[float, ...] = ()
+    contraction: float = 0.0
 
 
 class TubeDS(LatentDS):
@@ -116,13 +127,18 @@ class TubeDS(LatentDS):
     better and is better conditioned, and is then refined jointly. Across the path the latent point is drawn in at
     rate κ. The attractor is exact.
 
-    Several demonstrations of one motion are fitted by their mean path and timing (a common goal, aligned in time).
+    Several demonstrations of one motion are fitted by their mean path at equal progress, with a common goal, and by the
+    time law under which each, from where it starts, keeps its own times most nearly. What lies beside that path is
+    matched too, as far as it leaves room, so that ψ is near-isometric across it.
 
     Args:
         dim: n >= 1.
         n_layers: M >= 1; None for 300, or as many as it takes to follow the path: see ``DEPTHS``.
         contraction: κ > 0, per duration of the demonstration: a start off the path comes back within about
-            3/κ of it. A larger κ costs proportionally larger velocity gradients (see the report).
+            3/κ of it. A larger κ costs proportionally larger velocity gradients (see the report). None, the default,
+            is 20 for one demonstration, which says nothing about what lies beside it, and for several that one of
+            ``CONTRACTIONS`` under which their own starts lead most nearly along them. ``fit_report.contraction`` tells
+            it.
         refined: whether L-BFGS refines the match; without it a fit takes a tenth of the time.
         homotopy: the one that matching may follow, "linear" or "curvature" (n >= 2), or "both".
     """
@@ -136,7 +152,7 @@ class TubeDS(LatentDS):
         dim: int,
         *,
         n_layers: int | None = None,
-        contraction: float = 20.0,
+        contraction: float | None = None,
         refined: bool = True,
         homotopy: str = "both",
     ) -> None:
@@ -144,7 +160,7 @@ class TubeDS(LatentDS):
         psi = LocallyWeightedTranslations(dim, 1 if n_layers is None else n_layers, any_number=n_layers is None)
         super().__init__(dim, psi, TubeDynamics(along, across))
         self.n_layers = None if n_layers is None else psi.n_layers
-        self.contraction = number_in(contraction, "contraction", 0, float("inf"))
+        self.contraction = None if contraction is None else number_in(contraction, "contraction", 0, float("inf"))
         self.refined = bool(refined)
         known = ("linear", "curvature", "both") if self.dim > 1 else ("linear", "both")
         if homotopy not in known:
@@ -154,18 +170,19 @@ class TubeDS(LatentDS):
     def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> TubeDS:
         began = time.perf_counter()
         every = demonstrations_of(demonstration, self.dim)
-        shown, spread = mean_motion(every)
+        shown, strands, arrivals = mean_motion(every)
         # L-BFGS runs on to another match from another rounding, so that none may come from the units or the origin.
         origin, unit = shown.goal.numpy(), shown.size
         shape = Demonstration(((shown.positions - shown.goal) / unit).round(decimals=DECIMALS), shown.dt)
         path, way, times = arc_length_path(shape.positions.numpy(), shape.times.numpy(), N_POINTS)
         _refuse_crossings(path, origin, unit)
+        several = Several((strands - origin) / unit, arrivals) if len(every) > 1 else None
         with restore_on_failure(self, shown):
             law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
             judged = []
             for candidate in _candidates(path, self.n_layers or DEPTHS[0], self.homotopy):
-                self._take(candidate, shape, law)
-                judged.append((self._score(shape), candidate))
+                tube = candidate.widened(path, FIRST_STEPS) if several and self.refined else candidate
+                judged.append((self._score(tube, path, shape, law, several), tube))
             judged.sort(key=lambda pair: pair[0])
             if self.refined:
                 for tried, (score, candidate) in enumerate(list(judged)):
@@ -174,33 +191,64 @@ class TubeDS(LatentDS):
                     hopeless = self.n_layers is None and tried >= TRIES and min(score for score, _ in judged) > HOPELESS
                     if tried and (enough or hopeless) and not close:
                         break
-                    better = candidate.refined(path)
-                    self._take(better, shape, law)
-                    judged.append((self._score(shape), better))
+                    better = candidate.widened(path, STEPS) if several else candidate.refined(path)
+                    judged.append((self._score(better, path, shape, law, several), better))
             found = min(judged, key=lambda pair: pair[0])[1]
             notes: tuple[str, ...] = ()
             if self.n_layers is None:
                 found, notes = self._followed(found, path, shape, law)
             best = found.placed(origin, unit)
-            self._take(best, shown, law)
-            report = replace(self._report(best, origin + unit * path, shown, spread, began), notes=notes)
+            kappa = self.contraction or JUDGED
+            if several:
+                law, kappa, _ = self._settled(found, shape, law, several)
+            self._take(best, shown, law, kappa)
+            report = self._report(best, origin + unit * path, shown, began)
+            spread = tuple(float(value) for value in strands.std(0).mean(0))
+            report = replace(report, notes=notes, spread=spread, contraction=kappa)
             self.fit_report = replace(report, learned_from=tuple(one.fingerprint for one in every))
         return self
 
     @torch.no_grad()
-    def _take(self, candidate: Candidate, shown: Demonstration, law: PiecewiseLinearLaw) -> None:
+    def _take(self, candidate: Candidate, shown: Demonstration, law: PiecewiseLinearLaw, kappa: float = JUDGED) -> None:
         """Take a match, and the dynamics for it."""
         self.diffeomorphism.assign(*(torch.from_numpy(part) for part in candidate.layers))
         self.attractor.copy_(shown.goal)
         self.start.copy_(shown.start)
         far = torch.as_tensor(FAR * shown.size) / self.frame().length.cpu()
         self.dynamics.law = law.to(self.attractor)
-        transverse = PiecewiseLinearLaw(far.reshape(1), (far * self.contraction / shown.duration).reshape(1))
+        transverse = PiecewiseLinearLaw(far.reshape(1), (far * kappa / shown.duration).reshape(1))
         self.dynamics.transverse_law = transverse.to(self.attractor)
 
     @torch.no_grad()
-    def _score(self, shown: Demonstration) -> float:
-        """How badly it rolls out from the demonstrated start (thrice) and NEAR it, times √cond(J), or more."""
+    def _settled(
+        self, candidate: Candidate, shown: Demonstration, law: PiecewiseLinearLaw, several: Several
+    ) -> tuple[PiecewiseLinearLaw, float, float]:
+        """Time law and κ under which a match leads several from their own starts most nearly along; and how nearly.
+
+        The last is the mean distance in sizes of the motion.
+        """
+        self._take(candidate, shown, law)
+        progress = self.dynamics.phase(self.encode(torch.from_numpy(several.strands).to(self.attractor)), self.frame())
+        way, times = timing_of(progress.cpu().double().numpy(), several.arrivals)
+        law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
+        found = []
+        for kappa in CONTRACTIONS if self.contraction is None else (self.contraction,):
+            self._take(candidate, shown, law, kappa)
+            found.append((several.missed(self), kappa))
+        miss, kappa = min(found)
+        return law, kappa, miss
+
+    @torch.no_grad()
+    def _score(
+        self, candidate: Candidate, path: Array, shown: Demonstration, law: PiecewiseLinearLaw, several: Several | None
+    ) -> float:
+        """How badly it rolls out from the demonstrated start (thrice) and NEAR it, times √cond(J), or more.
+
+        Of several demonstrations, how badly their own starts lead along them and how badly what lies beside their mean
+        is matched count, too.
+        """
+        told = self._settled(candidate, shown, law, several)[2] if several else 0.0
+        self._take(candidate, shown, law)
         around = np.random.default_rng(1).standard_normal((STARTS, self.dim))
         around *= NEAR * shown.size / np.linalg.norm(around, axis=1, keepdims=True)
         starts = shown.start + torch.from_numpy(np.concatenate([np.zeros((1, self.dim)), around]))
@@ -214,7 +262,10 @@ class TubeDS(LatentDS):
         clocks = times + step * (ahead - ahead.round())[:, None]
         misses = [dtw(path, motion) / ROWS / shown.size for path, motion in zip(paths, shown.at(clocks), strict=True)]
         condition = float(self.condition_number(self._line()).max())
-        score = (3 * misses[0] + float(np.mean(misses[1:]))) * math.sqrt(condition)
+        score = (
+            3 * (misses[0] + told) + float(np.mean(misses[1:])) + (BESIDE * candidate.beside(path) if several else 0.0)
+        )
+        score *= math.sqrt(condition)
         score *= max(1.0, condition / MAX_CONDITION)
         return score if math.isfinite(score) else math.inf
 
@@ -269,9 +320,7 @@ class TubeDS(LatentDS):
         return frame.attractor + share.unsqueeze(-1) * frame.length * frame.axis
 
     @torch.no_grad()
-    def _report(
-        self, best: Candidate, path: Array, shown: Demonstration, spread: tuple[float, ...], began: float
-    ) -> TubeReport:
+    def _report(self, best: Candidate, path: Array, shown: Demonstration, began: float) -> TubeReport:
         line, frame = self._line(), self.frame()
         across = torch.linalg.svd(frame.axis.unsqueeze(-1))[0][:, 1:].T * TUBE * frame.length
         some = line[:: max(4, self.dim**2 // 16)]
@@ -292,8 +341,26 @@ class TubeDS(LatentDS):
             condition_tube=float(self.condition_number(tube).max()),
             largest_velocity=float(torch.linalg.vector_norm(self(y), dim=-1).max()) * shown.duration / length,
             largest_gradient=float(torch.linalg.matrix_norm(slopes, 2).max()) * shown.duration,
-            spread=spread,
         )
+
+
+class Several(NamedTuple):
+    """Several demonstrations, moved onto their common goal."""
+
+    strands: Array
+    """(K, N, n) each at even progress"""
+    arrivals: Array
+    """(K, N) when it is there, in seconds"""
+
+    def missed(self, ds: TubeDS) -> float:
+        """Mean distance of the motions from their starts to them, in units of the strands."""
+        misses = []
+        for strand, arrival in zip(self.strands, self.arrivals, strict=True):
+            times = np.linspace(0, arrival[-1], ROWS)
+            motion = np.stack([np.interp(times, arrival, column) for column in strand.T], axis=1)
+            path = ds.rollout(torch.from_numpy(strand[0]).to(ds.attractor), torch.from_numpy(times)).cpu().numpy()
+            misses.append(dtw(path, motion) / ROWS)
+        return float(np.mean(misses))
 
 
 class Candidate(NamedTuple):
@@ -308,6 +375,37 @@ class Candidate(NamedTuple):
         weights = np.ones(len(path))
         weights[[0, -1]] = 0.05 * len(path)  # the start must encode to the start, the goal to the goal
         return self._replace(layers=refine(self.layers, self.line, path, 0.95, weights=weights, steps=steps))
+
+    def widened(self, path: Array, steps: int) -> Candidate:
+        """Refined with what lies beside the path, (N, n): see :func:`latentds.fitting.bundle.bundle`."""
+        pairs = bundle(self.line, path, self._across(path))
+        return self._replace(layers=refine(self.layers, pairs.x, pairs.y, 0.95, weights=pairs.weights, steps=steps))
+
+    def beside(self, path: Array) -> float:
+        """How far, root mean square, what lies beside the line is carried from where it belongs beside the path."""
+        pairs = bundle(self.line, path, self._across(path))
+        squares = np.square(apply_layers(self.layers, pairs.x) - pairs.y).sum(1)
+        return float(np.sqrt((pairs.weights * squares).sum() / pairs.weights.sum()))
+
+    def _across(self, path: Array) -> Array:
+        """The directions beside the line, (n, n-1), that this match carries nearest to the path's :func:`frames`."""
+        axis = self.line[-1] - self.line[0]
+        length = float(np.linalg.norm(axis))
+        basis = across_of(axis / length)
+        if basis.shape[1] < 2:
+            return basis
+        some = slice(None, None, max(1, len(path) // 60))
+        sides = frames(smoothed(path))[some]
+        turned = np.zeros((basis.shape[1], basis.shape[1]))
+        for index, side in enumerate(basis.T):
+            step = 0.01 * length * side
+            moved = apply_layers(self.layers, np.concatenate([self.line[some] + step, self.line[some] - step]))
+            apart = np.subtract(*np.split(moved, 2))
+            turned[:, index] = np.einsum("in,ina->a", apart, sides)
+        left, _, right = np.linalg.svd(turned)
+        left[:, -1] *= np.linalg.det(left) * np.linalg.det(right)
+        rotated: Array = basis @ (left @ right).T
+        return rotated
 
     def placed(self, origin: Array, unit: float) -> Candidate:
         """The same match in other units, about another origin."""
@@ -383,23 +481,28 @@ def _blur(shown: Demonstration) -> str:
     return ""
 
 
-def mean_motion(shown: Sequence[Demonstration]) -> tuple[Demonstration, tuple[float, ...]]:
-    """The mean of several demonstrations, aligned in time, with the mean goal; and their spread, per coordinate."""
+def mean_motion(shown: Sequence[Demonstration]) -> tuple[Demonstration, Array, Array]:
+    """The mean of several demonstrations at equal progress, with the mean goal; each at even progress; and when.
+
+    Each, (K, N, n), is moved onto the common goal, the more the farther along it is; its times are (K, N), in seconds.
+    """
+    goal = np.mean([one.goal.numpy() for one in shown], axis=0)
+    paths, arrivals, even = [], [], np.linspace(0, 1, N_POINTS)
+    for one in shown:
+        path, way, times = arc_length_path(one.positions.numpy(), one.times.numpy(), N_POINTS)
+        paths.append(path + even[:, None] * (goal - path[-1]))
+        arrivals.append(np.interp(even, 1 - way, times))
+    strands = np.stack(paths)
     if len(shown) == 1:
-        return shown[0], (0.0,) * shown[0].dim
-    count = max(len(one) for one in shown)
-    share = np.linspace(0, 1, count)
-    paths = np.stack(
-        [
-            np.stack([np.interp(share, np.linspace(0, 1, len(one)), c) for c in one.positions.numpy().T], 1)
-            for one in shown
-        ]
+        return shown[0], strands, np.stack(arrivals)
+    count, arrival = max(len(one) for one in shown), np.mean(arrivals, axis=0)
+    at = np.interp(np.linspace(0, arrival[-1], count), arrival, even)
+    mean = np.stack([np.interp(at, even, column) for column in strands.mean(0).T], axis=1)
+    return (
+        Demonstration(torch.from_numpy(mean), arrival[-1] / (count - 1), f"mean of {len(shown)}"),
+        strands,
+        np.stack(arrivals),
     )
-    goal = paths[:, -1].mean(0)
-    paths += share[:, None] * (goal - paths[:, -1:])
-    duration = float(np.mean([one.duration for one in shown]))
-    mean = Demonstration(torch.from_numpy(paths.mean(0)), duration / (count - 1), f"mean of {len(shown)}")
-    return mean, tuple(float(value) for value in paths.std(0).mean(0))
 
 
 def _refuse_crossings(path: Array, origin: Array, unit: float) -> None:

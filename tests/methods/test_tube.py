@@ -270,7 +270,7 @@ def test_far_starts_and_starts_behind_the_goal_arrive_without_wild_speeds(dim, d
         path = ds.rollout(starts, times)
         speeds = ds(path).norm(dim=-1).amax(dim=-1)
     assert ((path[:, -1] - shown.goal).norm(dim=-1) < 1e-3 * shown.size).all()
-    pull = 0.25 * ds.contraction * shown.size / shown.duration  # as fast as it may come in from the side
+    pull = 0.25 * ds.fit_report.contraction * shown.size / shown.duration  # as fast as it may come in from the side
     most = shown.velocities.norm(dim=-1).max() + pull
     assert speeds.max() < 3 * ds.fit_report.condition_tube * most
 
@@ -308,12 +308,14 @@ def test_bad_contraction(contraction):
 # --- several demonstrations -------------------------------------------------------------------------------------------
 
 
-def family(count=5, *, end_apart=0.0):
-    """One bend, wider and narrower, from starts in a row; each of another length."""
+def family(count=5, *, end_apart=0.0, power=1):
+    """One bend, wider and narrower, from starts in a row; each of another length. Offsets die as (1 - way)^power."""
     found = []
     for i, wide in enumerate(np.linspace(-1, 1, count)):
         way = np.linspace(0, 1, 300 + 20 * i)
-        bend = np.stack([1 - way, (0.3 + 0.1 * wide) * np.sin(np.pi * way) + 0.15 * wide * (1 - way)], 1)
+        bend = np.stack(
+            [1 - way, (0.3 + 0.1 * wide * (power == 1)) * np.sin(np.pi * way) + 0.15 * wide * (1 - way) ** power], 1
+        )
         found.append(Demonstration(bend + end_apart * np.array([wide, 0]), 0.01, f"{i}"))
     return found
 
@@ -337,11 +339,68 @@ def test_several_agree_on_a_goal_and_report_their_spread():
 
 def test_mean_of_equal_ones_is_each_of_them():
     shown = family()[0]
-    mean, spread = mean_motion([shown] * 3)
-    torch.testing.assert_close(mean.positions, shown.positions)
+    mean, strands, _ = mean_motion([shown] * 3)
+    torch.testing.assert_close(mean.positions, shown.positions, rtol=0, atol=1e-3)
     assert mean.dt == pytest.approx(shown.dt)
-    assert max(spread) < 1e-12
-    assert mean_motion([shown]) == (shown, (0.0, 0.0))
+    assert strands.std(0).max() < 1e-12
+    alone, strands, _ = mean_motion([shown])
+    assert alone == shown
+    assert len(strands) == 1
+
+
+def test_the_mean_does_not_smear_a_corner_that_all_took_at_another_time():
+    """One pauses before a corner, one behind it: at equal times their mean cuts it, at equal progress it does not."""
+    corner = np.concatenate([np.linspace([0, 1], [1, 1], 200), np.linspace([1, 1], [1, 0], 200)[1:]])
+    early, late = np.linspace(0, 1, 400) ** 2, np.linspace(0, 1, 400) ** 0.5
+    shown = [
+        Demonstration(np.stack([np.interp(pace, np.linspace(0, 1, 399), c) for c in corner.T], 1), 0.01)
+        for pace in (early, late)
+    ]
+    mean = mean_motion(shown)[0].positions
+    assert torch.linalg.vector_norm(mean - tensor([1.0, 1.0]), dim=1).min() < 0.02
+
+
+# --- beside the path --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_several_make_the_map_near_isometric_across_the_path():
+    """Points at a distance from the path encode to that distance from the axis, in the scale of the axis."""
+    shown = family()
+    ds = TubeDS(2, n_layers=150).fit(shown)
+    mean = mean_motion(shown)[0]
+    path, tangents = mean.positions[30:-30:10], torch.nn.functional.normalize(mean.velocities[30:-30:10], dim=-1)
+    across = torch.stack([-tangents[:, 1], tangents[:, 0]], dim=1)
+    length = torch.linalg.vector_norm(mean.positions.diff(dim=0), dim=-1).sum()
+    for distance in (0.02 * mean.size, -0.05 * mean.size):
+        with torch.no_grad():
+            x, frame = ds.encode(path + distance * across), ds.frame()
+        offset = x - frame.attractor
+        aside = (offset - (offset @ frame.axis).unsqueeze(-1) * frame.axis).norm(dim=-1)
+        ratio = aside / abs(distance) * length / frame.length
+        assert ratio.min() > 0.75
+        assert ratio.max() < 1.33
+
+
+def test_the_contraction_is_read_unless_it_is_asked_for():
+    shown = family()
+    read, asked = fast(2).fit(shown), TubeDS(2, refined=False, contraction=9.0).fit(shown)
+    assert 1 <= read.fit_report.contraction < 9
+    assert asked.fit_report.contraction == 9
+    assert read.contraction is None
+    assert fast(2).fit(shown[0]).fit_report.contraction == 20
+    assert fast(2).fit(family(power=12)).fit_report.contraction > read.fit_report.contraction
+
+
+def test_each_of_several_keeps_its_own_time():
+    shown = family()
+    ds = fast(2).fit(shown)
+    with torch.no_grad():
+        left = ds.dynamics.law.time_to_go(
+            ds.dynamics.phase(ds.encode(torch.stack([d.start for d in shown])), ds.frame())
+        )
+    mean = np.mean([d.duration for d in shown])
+    assert abs(left.mean() - mean) < 0.1 * mean
 
 
 # --- units, types, report ---------------------------------------------------------------------------------------------

@@ -1,0 +1,190 @@
+"""What lies beside a path: frames carried along it, how far a tube around it may reach, and how offsets die in it."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+from scipy.ndimage import gaussian_filter1d, minimum_filter1d
+from scipy.optimize import lsq_linear
+
+from .strands import Strands
+
+Array = NDArray[np.float64]
+
+WIDE = 0.2
+"""Radius of the tube in sizes of the motion, where the path leaves room for it, …"""
+ROOM, BEND = 0.4, 0.6
+"""… that is, less than such a share of the distance to the next strand, and of the radius of curvature; …"""
+THIN = 0.05
+"""… but no thinner than such a share of ``WIDE``."""
+SMOOTH = 0.05
+"""Standard deviation, in sizes of the motion, over which a path is averaged that a whole tube lies around: hooks that
+are smaller than the tube are wide are no turns of the tube."""
+EXTENDED = 0.15, 0.05
+"""How far the path is carried on straight before its start and beyond its goal, in sizes, where there is room."""
+LIGHT = 0.3
+"""Weight of what lies beside the path: a point there counts as so many of the path."""
+CELLS, FASTEST, TRUST = 60, 10.0, 0.03
+"""Stretches of the way, each with a pace of its own, that :func:`timing_of` tells apart; most speed in mean speeds; and
+what a pace far from the mean costs beside the times that it explains."""
+
+
+class Bundle(NamedTuple):
+    """Pairs of points that a near-isometric map of a line's surroundings to a path's would take to one another."""
+
+    x: Array
+    """(m, n) on the latent line, its extensions and beside both"""
+    y: Array
+    """(m, n) where they belong"""
+    weights: Array
+    """(m,)"""
+
+
+def bundle(line: Array, path: Array, across: Array) -> Bundle:
+    """The line (N, n) with what lies beside it, and the path (N, n) with what lies there.
+
+    Args:
+        line: evenly spaced.
+        path: evenly spaced.
+        across: (n, n-1) the directions beside the line that :func:`frames` of the path belong to.
+    """
+    count, dim = path.shape
+    size, length = float(np.ptp(path, axis=0).max()), float(path_steps(path).sum())
+    axis = line[-1] - line[0]
+    scale = float(np.linalg.norm(axis)) / length
+    axis = axis / np.linalg.norm(axis)
+    smooth = smoothed(path)
+    reach = radius(path, smooth, WIDE * size)
+    middle = path + (reach / (WIDE * size))[:, None] * (smooth - path)
+    sides = frames(smooth)
+    x, y = [line], [path]
+    weights = [np.ones(count)]
+    weights[0][[0, -1]] = 0.05 * count  # the start must encode to the start, the goal to the goal
+    every = max(2, 2 * (dim - 1))
+    for side in range(dim - 1):
+        for sign in (-1, 1):
+            offset = sign * reach[::every, None]
+            offset[1::2] /= 2
+            x.append(line[::every] + scale * offset * across[:, side])
+            y.append(middle[::every] + offset * sides[::every, :, side])
+            weights.append(np.full(len(offset), LIGHT * every / (dim - 1)))
+    directions = directions_along(smooth)
+    for end, sign, far, weight in ((0, -1, EXTENDED[0], 1.0), (-1, 1, EXTENDED[1], LIGHT)):
+        ahead = np.linspace(0, far * size, 12)[1:, None]
+        ahead = ahead[: _free(path[end] + sign * ahead * directions[end], path, ahead[:, 0])]
+        for side in (None, *range(dim - 1)):
+            for turn in (0,) if side is None else (-1, 1):
+                beside = across[:, side or 0] * turn * reach[end] if dim > 1 else np.zeros(dim)
+                there = sides[end, :, side or 0] * turn * reach[end] if dim > 1 else np.zeros(dim)
+                x.append(line[end] + scale * (sign * ahead * axis + beside))
+                y.append(path[end] + sign * ahead * directions[end] + there)
+                weights.append(np.full(len(ahead), weight / (1 if side is None else dim - 1)))
+    return Bundle(np.concatenate(x), np.concatenate(y), np.concatenate(weights))
+
+
+def _free(points: Array, path: Array, away: Array) -> int:
+    """How many points of a straight extension lie nearer to the path's end than to any other part, but for half."""
+    nearest = np.linalg.norm(points[:, None] - path[None], axis=2).min(1)
+    blocked = np.flatnonzero(nearest < 0.95 * away)
+    return len(points) if not len(blocked) else int(blocked[0]) // 2
+
+
+def path_steps(path: Array) -> Array:
+    """Lengths of the steps of a path, (N, n) -> (N-1,)."""
+    found: Array = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    return found
+
+
+def smoothed(path: Array) -> Array:
+    """An evenly spaced path averaged over ``SMOOTH`` of its size, the ends kept: (N, n) -> (N, n)."""
+    step = float(path_steps(path).mean())
+    width = SMOOTH * float(np.ptp(path, axis=0).max()) / step
+    count = len(path)
+    pad = min(count - 1, int(4 * width) + 1)
+    before, after = 2 * path[0] - path[pad:0:-1], 2 * path[-1] - path[-2 : -2 - pad : -1]
+    found: Array = gaussian_filter1d(np.concatenate([before, path, after]), width, axis=0)[pad : pad + count]
+    return found
+
+
+def radius(path: Array, smooth: Array, wanted: float) -> Array:
+    """How wide a tube around an evenly spaced path (N, n) may be at each point, at most ``wanted``: (N,)."""
+    clearance = Strands(path).clearance(path)
+    tangents = np.gradient(smooth, axis=0)
+    speeds = np.maximum(np.linalg.norm(tangents, axis=1), 1e-12 * np.ptp(path, axis=0).max())
+    bends = np.linalg.norm(np.gradient(tangents / speeds[:, None], axis=0), axis=1) / speeds
+    most = np.minimum(ROOM * clearance, BEND / np.maximum(bends, 1e-12 / wanted))
+    near = max(1, len(path) // 60)
+    most = gaussian_filter1d(minimum_filter1d(most, 2 * near + 1), near, mode="nearest")
+    found: Array = np.minimum(np.clip(most, THIN * wanted, wanted), ROOM * clearance)
+    return found
+
+
+def directions_along(path: Array) -> Array:
+    """Unit tangents of a smooth path: (N, n) -> (N, n)."""
+    tangents = np.gradient(path, axis=0)
+    lengths = np.linalg.norm(tangents, axis=1, keepdims=True)
+    found: Array = tangents / np.maximum(lengths, 1e-12 * lengths.max())
+    return found
+
+
+def frames(path: Array) -> Array:
+    """Directions across a path, turned no more than it turns (Bishop 1975): (N, n) -> (N, n, n-1), orthonormal.
+
+    With the tangent first they are right-handed.
+    """
+    tangents = directions_along(path)
+    found = np.empty((*path.shape, path.shape[1] - 1))
+    found[0] = across_of(tangents[0])
+    for i, (before, after) in enumerate(pairwise(tangents)):
+        both = before + after
+        found[i + 1] = found[i] - np.outer(both, after @ found[i]) / max(1 + float(before @ after), 1e-9)
+    return found
+
+
+def across_of(direction: Array) -> Array:
+    """n-1 directions at right angles to one (n,), right-handed with it first: (n, n-1)."""
+    basis = np.linalg.qr(np.column_stack([direction, np.eye(len(direction))]))[0]
+    basis[:, 0] = direction
+    if len(direction) > 1 and np.linalg.det(basis) < 0:
+        basis[:, -1] *= -1
+    return basis[:, 1:]
+
+
+def timing_of(progress: Array, times: Array) -> tuple[Array, Array]:
+    """When a motion passes where, such that each of several, from where it starts, keeps its own times most nearly.
+
+    Those that start behind the mean must not wait where the others stood at rest, and none may be slow where only
+    others were. The seconds that a stretch takes are found by least squares, which is a bounded linear problem.
+
+    Args:
+        progress: (K, N) where demonstrations are, 1 at the mean start and 0 at the goal.
+        times: (K, N) when, in seconds.
+
+    Returns:
+        Progress, falling from the hindmost start to 0, and seconds, rising from 0, both (m,).
+    """
+    passed = np.minimum.accumulate(np.maximum(progress, 0), axis=1)
+    edges = np.linspace(0, max(1.0, float(passed[:, 0].max())), CELLS + 1)
+    width, low, high = edges[1], edges[:-1], edges[1:]
+    some = np.linspace(0, passed.shape[1] - 1, CELLS + 1).round().astype(int)[1:]
+    starts, there = passed[:, :1, None], passed[:, some, None]
+    spent = (np.clip(starts, low, high) - np.clip(there, low, high)).reshape(-1, CELLS)
+    mean = np.interp(-edges, -passed.mean(0), times.mean(0))
+    usual = np.maximum(-np.diff(mean), 1e-3 * mean[0]) / width
+    trust = TRUST * width * math.sqrt(CELLS) * np.eye(CELLS)
+    share = 1 / math.sqrt(len(spent))
+    duration = float(times[:, -1].mean())
+    pace = lsq_linear(
+        np.concatenate([share * spent, trust]),
+        np.concatenate([share * times[:, some].reshape(-1), trust @ usual]),
+        bounds=(duration / FASTEST, np.inf),
+        method="bvls",  # exact, so that the unit of time makes no difference
+    ).x
+    arrivals = np.concatenate([[0.0], np.cumsum(width * pace[::-1])])
+    way = np.linspace(edges[-1], 0, 10 * CELLS + 1)
+    return way, PchipInterpolator(edges[-1] - edges[::-1], arrivals)(edges[-1] - way)
