@@ -18,6 +18,7 @@ from latentds.demonstration import Demonstration, demonstrations_of, goal_apart
 from latentds.dynamics import Frame, LatentDynamics
 
 from .couplings import AffineCouplings, no_autocast
+from .networks import linear, seeded_generator
 from .training import Plan, Training, descend
 
 PLANS = {
@@ -76,7 +77,7 @@ class SDSEF(LatentDS):
         if recipe not in list(PLANS):
             raise ValueError(f"recipe: expected one of {sorted(PLANS)}, got {recipe!r}")
         self_seed = None if seed is None else whole_number(seed, "seed", at_least=0)
-        generator = _generator(self_seed)
+        generator = seeded_generator(self_seed)
         psi = AffineCouplings(dim, n_layers, n_features, generator=generator)
         super().__init__(dim, psi, NormalizedDescent(psi, generator=generator))
         self.n_layers, self.n_features = psi.n_layers, psi.n_features
@@ -97,7 +98,7 @@ class SDSEF(LatentDS):
         plan = PLANS[self.recipe]
         plan = plan if self.epochs is None else replace(plan, epochs=self.epochs)
         train = _train_tuned if self.recipe == "tuned" else _train_official
-        training = train(learner, data, plan, _generator(self.seed), progress)
+        training = train(learner, data, plan, seeded_generator(self.seed), progress)
         self.load_state_dict(learner.state_dict())
         self._place(data, shown)
         with torch.no_grad():
@@ -144,8 +145,8 @@ class NormalizedDescent(LatentDynamics):
         super().__init__()
         object.__setattr__(self, "psi", diffeomorphism)
         sizes = [diffeomorphism.dim, 100, 100, 1]
-        linear = [_linear(a, b, generator) for a, b in pairwise(sizes)]
-        self.network = nn.Sequential(linear[0], nn.LeakyReLU(), linear[1], nn.LeakyReLU(), linear[2])
+        maps = [linear(a, b, generator) for a, b in pairwise(sizes)]
+        self.network = nn.Sequential(maps[0], nn.LeakyReLU(), maps[1], nn.LeakyReLU(), maps[2])
         self.register_buffer("duration", torch.ones((), dtype=torch.float64))
         self.register_buffer("log_speed_range", torch.tensor([-1.0, 1.0], dtype=torch.float64))
 
@@ -392,19 +393,3 @@ def _cumulative(f: Tensor) -> Tensor:
 def _hermite(s: Tensor, left: Tensor, right: Tensor) -> Tensor:
     """From 0 to 1 over s in [0, 1], with slopes ``left`` at 0 and ``right`` at 1."""
     return s * (left + s * (3 - 2 * left - right + s * (left + right - 2)))
-
-
-def _generator(seed: int | None) -> torch.Generator | None:
-    return None if seed is None else torch.Generator().manual_seed(seed)
-
-
-def _linear(n_in: int, n_out: int, generator: torch.Generator | None) -> nn.Linear:
-    """torch's own initial weights, but from a generator and without touching the global one."""
-    device = torch.get_default_device()  # which skip_init does not ask
-    layer: nn.Linear = nn.utils.skip_init(  # type: ignore[no-untyped-call]
-        nn.Linear, n_in, n_out, dtype=torch.float64, device=device
-    )
-    bound = n_in**-0.5
-    for part in (layer.weight, layer.bias):
-        nn.init.uniform_(part, -bound, bound, generator=generator)
-    return layer

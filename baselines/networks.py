@@ -1,0 +1,155 @@
+"""Small networks, and the fit that methods share which regress velocities by gradient."""
+
+from __future__ import annotations
+
+import math
+import time
+from abc import abstractmethod
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from typing import NamedTuple, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from latentds.arguments import whole_number
+from latentds.base import FitReport, StableDS
+from latentds.demonstration import Demonstration, demonstrations_of, goal_apart
+
+from .couplings import no_autocast
+from .training import Plan, descend
+
+Self = TypeVar("Self", bound="VelocityRegression")
+
+
+MOST = 2000
+"""Samples of all demonstrations together above which only every second, third, … is taken: they lie close together."""
+
+
+class Pooled(NamedTuple):
+    """Samples of several demonstrations, in units of the box around them all and of their mean duration."""
+
+    points: Tensor
+    """(N, n), from the common goal"""
+    velocities: Tensor
+    """(N, n)"""
+    goal: Tensor
+    """(n,) the mean of their goals, in their own units"""
+    scale: Tensor
+    """(n,) extents of the box, in their own units; an axis at rest is noise, not motion, and gets a least extent"""
+    duration: float
+    """seconds"""
+
+    @classmethod
+    def of(cls, shown: Sequence[Demonstration]) -> Pooled:
+        goal = torch.stack([d.goal for d in shown]).mean(0)
+        for d in shown:
+            goal_apart(d, goal)
+        points, velocities = (torch.cat([getattr(d, part) for d in shown]) for part in ("positions", "velocities"))
+        extent = points.amax(0) - points.amin(0)
+        scale = extent.clamp(min=1e-6 * float(extent.max()))
+        duration = sum(d.duration for d in shown) / len(shown)
+        every = math.ceil(len(points) / MOST)
+        return cls((points[::every] - goal) / scale, velocities[::every] / scale * duration, goal, scale, duration)
+
+
+class VelocityRegression(StableDS):
+    """ẏ = scale ∘ f(u) / duration, u = (y - y*) / scale, with f learned from velocities by gradient.
+
+    Learns from one demonstration or from several, pooled; the mean of their goals is the attractor.
+    ``fit_report.mse`` is the mean over all N n entries of the squared velocity error, (units / second)².
+
+    Args:
+        dim: n >= 1.
+        seed: of the initial networks and the batches; None draws them from torch's generator.
+        epochs: passes over the samples, >= 1.
+
+    Attributes:
+        scale: (n,) buffer, > 0, units of y.
+        duration: () buffer, > 0, seconds.
+    """
+
+    scale: Tensor
+    duration: Tensor
+
+    def __init__(self, dim: int, *, seed: int | None, epochs: int) -> None:
+        super().__init__(dim)
+        self.seed = None if seed is None else whole_number(seed, "seed", at_least=0)
+        self.epochs = whole_number(epochs, "epochs", at_least=1)
+        self.register_buffer("scale", torch.ones(self.dim, dtype=torch.float64))
+        self.register_buffer("duration", torch.ones((), dtype=torch.float64))
+
+    @property
+    @abstractmethod
+    def plan(self) -> Plan:
+        """How ``fit`` descends."""
+
+    @abstractmethod
+    def normalized_velocity(self, u: Tensor) -> Tensor:
+        """f: (..., n) -> (..., n)."""
+
+    def fit(self: Self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> Self:
+        shown = demonstrations_of(demonstration, self.dim)
+        began = time.perf_counter()
+        data = Pooled.of(shown)
+        # A fresh system is trained, in float32, and an interrupted fit leaves self alone.
+        learner = type(self)(**self.settings).to(self.attractor.device, torch.float32)
+        points, velocities = data.points.to(learner.attractor), data.velocities.to(learner.attractor)
+        typical = velocities.square().sum(-1).mean()
+
+        def loss(batch: Tensor) -> Tensor:
+            missed = learner.normalized_velocity(points[batch]) - velocities[batch]
+            return missed.square().sum(-1).mean() / typical
+
+        training = descend(
+            loss,
+            list(learner.parameters()),
+            len(points),
+            self.plan,
+            generator=seeded_generator(self.seed),
+            progress=progress,
+        )
+        self.load_state_dict(learner.state_dict())
+        with torch.no_grad():
+            self.attractor.copy_(data.goal)
+            self.scale.copy_(data.scale)
+            self.duration.fill_(data.duration)
+            missed = [self(d.positions.to(self.attractor)) - d.velocities.to(self.attractor) for d in shown]
+            mse = float(torch.cat(missed).square().mean())
+        seconds, origins = time.perf_counter() - began, tuple(d.fingerprint for d in shown)
+        self.fit_report = FitReport(mse, 0, seconds, training.history, training.notes, origins)
+        return self
+
+    def forward(self, y: Tensor) -> Tensor:
+        points, wanted = self._points(y)
+        with no_autocast(points):
+            velocity = self.normalized_velocity(self._normalize(points))
+        return (velocity * self.scale / self.duration).to(wanted)
+
+    def _normalize(self, points: Tensor) -> Tensor:
+        return (points - self.attractor) / self.scale
+
+
+def seeded_generator(seed: int | None) -> torch.Generator | None:
+    """None, torch's own generator, for None."""
+    return None if seed is None else torch.Generator().manual_seed(seed)
+
+
+def perceptron(sizes: Iterable[int], generator: torch.Generator | None) -> nn.Sequential:
+    """Linear maps between these sizes, in float64, with SiLU between them."""
+    parts: list[nn.Module] = []
+    for n_in, n_out in pairwise(sizes):
+        parts += [linear(n_in, n_out, generator), nn.SiLU()]
+    return nn.Sequential(*parts[:-1])
+
+
+def linear(n_in: int, n_out: int, generator: torch.Generator | None) -> nn.Linear:
+    """torch's own initial weights, but from a generator and without touching the global one."""
+    device = torch.get_default_device()  # which skip_init does not ask
+    layer: nn.Linear = nn.utils.skip_init(  # type: ignore[no-untyped-call]
+        nn.Linear, n_in, n_out, dtype=torch.float64, device=device
+    )
+    bound = n_in**-0.5
+    for part in (layer.weight, layer.bias):
+        nn.init.uniform_(part, -bound, bound, generator=generator)
+    return layer
