@@ -77,11 +77,9 @@ class NeuralLyapunov(VelocityRegression):
     def _energy(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """V and ∇V at u: (..., n) -> (...), (..., n)."""
         value, slope = self.convex(u)
-        level, _ = self.convex(torch.zeros_like(self.attractor))
-        above = value - level
-        ramp = (above / SMOOTH).clamp(0, 1)
-        energy = ramp * (above - 0.5 * SMOOTH * ramp) + QUADRATIC * u.square().sum(-1)
-        return energy, ramp.unsqueeze(-1) * slope + 2 * QUADRATIC * u
+        level, tilt = self.convex(torch.zeros_like(self.attractor))
+        energy = value - level - (u * tilt).sum(-1) + QUADRATIC * u.square().sum(-1)
+        return energy, slope - tilt + 2 * QUADRATIC * u
 
 
 class InputConvex(nn.Module):
