@@ -1,0 +1,173 @@
+"""Gaussian mixtures, and regression by them: what several methods take their linear pieces from."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from latentds.arguments import check_points, whole_number
+
+Array = NDArray[np.float64]
+
+MOST_COMPONENTS = 12
+"""How many the Bayesian information criterion may choose from."""
+RIDGE = 1e-6
+"""Added to the variances of normalised samples, so that a coordinate at rest has one."""
+
+
+class GaussianMixture(nn.Module):
+    """Weighted Gaussian densities h_k exp(-½ ‖W_k (x - μ_k)‖²) over R^n; one of height 1 around 0 until assigned.
+
+    No value of a parameter is forbidden: W_kᵀ W_k is a precision whatever W_k is, and heights are kept as logarithms.
+    ``load_state_dict`` takes any number of components.
+
+    Args:
+        dim: n >= 1.
+        n_components: K >= 1.
+
+    Attributes:
+        log_heights: (K,), log h_k: of a mixture with weights π_k log π_k + log |det W_k|, up to a common constant.
+        means: (K, n), μ_k.
+        whiteners: (K, n, n), W_k.
+    """
+
+    def __init__(self, dim: int, n_components: int = 1) -> None:
+        super().__init__()
+        self.dim = whole_number(dim, "dim", at_least=1)
+        count = whole_number(n_components, "n_components", at_least=1)
+        self.log_heights = nn.Parameter(torch.zeros(count, dtype=torch.float64))
+        self.means = nn.Parameter(torch.zeros(count, self.dim, dtype=torch.float64))
+        self.whiteners = nn.Parameter(torch.eye(self.dim, dtype=torch.float64).expand(count, -1, -1).clone())
+
+    @property
+    def n_components(self) -> int:
+        return len(self.log_heights)
+
+    def assign(self, weights: Any, means: Any, covariances: Any) -> None:
+        """Become the mixture with weights (K,) > 0, means (K, n) and covariances (K, n, n), positive definite."""
+        roots = np.linalg.cholesky(np.asarray(covariances, dtype=np.float64))
+        whiteners = np.linalg.inv(roots)
+        heights = np.log(weights) - np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(1)
+        resize(self, {"log_heights": heights, "means": means, "whiteners": whiteners})
+
+    def log_densities(self, x: Tensor) -> Tensor:
+        """log h_k - ½ ‖W_k (x - μ_k)‖², each component's: (..., n) -> (..., K)."""
+        check_points(self.dim, x, "x")
+        offsets = x.unsqueeze(-2) - self.means
+        apart = (self.whiteners * offsets.unsqueeze(-2)).sum(-1)
+        return self.log_heights - apart.square().sum(-1) / 2
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The components' responsibilities for x, which are >= 0 and add up to 1: (..., n) -> (..., K)."""
+        return torch.softmax(self.log_densities(x), dim=-1)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        make_room(self, state_dict, prefix)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+class MixtureRegression(nn.Module):
+    """Affine maps mixed by a Gaussian mixture of their inputs, x ↦ Σ_k γ_k(x) (A_k x + b_k); zero until assigned.
+
+    That is Gaussian mixture regression (Ghahramani and Jordan 1994): the mean of v given x in a mixture over (x, v).
+    ``load_state_dict`` takes any number of components.
+
+    Args:
+        dim: n >= 1, of inputs and of outputs.
+        n_components: K >= 1.
+
+    Attributes:
+        mixture: γ, over the inputs.
+        slopes: (K, n, n), A_k.
+        offsets: (K, n), b_k.
+    """
+
+    def __init__(self, dim: int, n_components: int = 1) -> None:
+        super().__init__()
+        self.mixture = GaussianMixture(dim, n_components)
+        count, dim = self.mixture.n_components, self.mixture.dim
+        self.slopes = nn.Parameter(torch.zeros(count, dim, dim, dtype=torch.float64))
+        self.offsets = nn.Parameter(torch.zeros(count, dim, dtype=torch.float64))
+
+    def assign(self, weights: Array, means: Array, covariances: Array) -> None:
+        """Become the regression by the mixture over (x, v): (K,), (K, 2n), (K, 2n, 2n), as ``GaussianMixture``'s."""
+        n = self.mixture.dim
+        self.mixture.assign(weights, means[:, :n], covariances[:, :n, :n])
+        slopes = np.linalg.solve(covariances[:, :n, :n], covariances[:, :n, n:]).swapaxes(1, 2)
+        offsets = means[:, n:] - np.einsum("kij,kj->ki", slopes, means[:, :n])
+        resize(self, {"slopes": slopes, "offsets": offsets})
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., n) -> (..., n)."""
+        shares = self.mixture(x).unsqueeze(-1)
+        values = (self.slopes * x.unsqueeze(-2).unsqueeze(-2)).sum(-1) + self.offsets
+        mixed: Tensor = (shares * values).sum(-2)
+        return mixed
+
+    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
+        make_room(self, state_dict, prefix)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+def fit_mixture(
+    samples: Array, n_components: int | None, seed: int, *, most: int = MOST_COMPONENTS
+) -> tuple[Array, Array, Array]:
+    """Weights (K,), means (K, d) and full covariances (K, d, d) of a mixture of samples (N, d), by scikit-learn's EM.
+
+    Args:
+        samples: (N, d), of about unit size: ``RIDGE`` is added to their variances.
+        n_components: K >= 1; None for the number of 1 to ``most`` with the least Bayesian information criterion.
+        seed: of the k-means that EM starts from.
+        most: >= 1.
+    """
+    sklearn = scikit_learn("mixture")
+    most = min(most, len(samples) // (2 * samples.shape[1]) or 1)
+    counts = range(1, most + 1) if n_components is None else [n_components]
+    fits = [
+        sklearn.GaussianMixture(count, reg_covar=RIDGE, random_state=seed, max_iter=200).fit(samples)
+        for count in counts
+    ]
+    best = fits[0] if len(fits) == 1 else min(fits, key=lambda fit: float(fit.bic(samples)))
+    return best.weights_, best.means_, best.covariances_
+
+
+def scikit_learn(module: str) -> Any:
+    """A part of scikit-learn, which only fitting needs.
+
+    Raises:
+        ImportError: without it; the message says how to install it.
+    """
+    try:
+        return importlib.import_module(f"sklearn.{module}")
+    except ImportError as error:
+        raise ImportError("Gaussian mixtures need scikit-learn: pip install 'latentds[field]'") from error
+
+
+def drawn_seed(seed: int | None) -> int:
+    """``seed``, or one from torch's generator."""
+    return int(torch.randint(2**31 - 1, ())) if seed is None else seed
+
+
+@torch.no_grad()
+def resize(module: nn.Module, values: dict[str, Any]) -> None:
+    """Give parameters of ``module`` new values, of whatever shape; they stay on its device and in its dtype."""
+    for name, value in values.items():
+        old = module.get_parameter(name)
+        new = torch.as_tensor(value).to(old)
+        if old.shape == new.shape:
+            old.copy_(new)
+        else:
+            setattr(module, name, nn.Parameter(new.clone(), requires_grad=old.requires_grad))
+
+
+def make_room(module: nn.Module, state: dict[str, Tensor], prefix: str) -> None:
+    """Let parameters have the number of components, their first size, that a state to be loaded has."""
+    for name, held in module.named_parameters(recurse=False):
+        found = state.get(prefix + name)
+        if found is not None and found.ndim == held.ndim and found.shape[1:] == held.shape[1:] and len(found):
+            resize(module, {name: held.new_zeros(found.shape)})
