@@ -7,7 +7,6 @@ from torch import Tensor
 from latentds.arguments import whole_number
 
 from .networks import VelocityRegression, perceptron, seeded_generator
-from .training import Plan
 
 
 class BehaviourCloning(VelocityRegression):
@@ -31,10 +30,6 @@ class BehaviourCloning(VelocityRegression):
         self.n_units = whole_number(n_units, "n_units", at_least=1)
         sizes = [self.dim, *[self.n_units] * 3, self.dim]
         self.network = perceptron(sizes, seeded_generator(self.seed))
-
-    @property
-    def plan(self) -> Plan:
-        return Plan(self.epochs, learning_rate=3e-3, n_batches=4, warm_up=0.05, clip=1.0)
 
     def normalized_velocity(self, u: Tensor) -> Tensor:
         velocity: Tensor = self.network(u)

@@ -12,22 +12,23 @@ from latentds.arguments import number_in, whole_number
 
 from .couplings import no_autocast
 from .networks import VelocityRegression, linear, perceptron, seeded_generator
-from .training import Plan
 
-SMOOTH = 0.1
-"""d, width of the parabola that rounds the corner of a rectifier."""
 QUADRATIC = 1e-2
 """ε, weight of ‖u‖² in V, which makes it positive and unbounded whatever was learned."""
 
 
 class NeuralLyapunov(VelocityRegression):
-    """f = f̂ - ∇V relu(∇V·f̂ + αV) / ‖∇V‖², so that V̇ <= -αV everywhere (Manek and Kolter 2019, eq. 10 and 13).
+    """f = f̂ - ∇V relu(∇V·f̂ + αV) / ‖∇V‖², so that V̇ <= -αV everywhere (Manek and Kolter 2019, sec. 3.2).
 
-    In u, positions from the goal in sizes of the motion: V = σ(g(u) - g(0)) + ε‖u‖² with g an input-convex network
-    and σ a smooth rectifier, and f̂ a plain network. Both are learned together from velocities.
+    In u, positions from the goal in sizes of the motion: V = g(u) - g(0) - ∇g(0)·u + ε‖u‖² with g an input-convex
+    network, and f̂(u) = N(u) - N(0) with N a plain one. Both are learned together from velocities.
 
-    The paper's f̂(0) need not be 0, and f then jumps at the goal. Ours is N(u) - N(0): the goal is an equilibrium, and
-    f is Lipschitz there too. f has kinks where the projection sets in.
+    Where this differs from the paper, and why. Its V = σ(g(u) - g(0)) + ε‖u‖², σ a smooth rectifier, is flat wherever
+    g lies below g(0), and training stays there; taking away the tangent at 0 gives the same functions, those convex
+    and least at 0, without that trap. Its f̂(0) need not be 0, and f then jumps at the goal; ours is an equilibrium, and
+    f Lipschitz there too. f has kinks where the projection sets in.
+
+    Where nothing was shown, a motion may run along the level sets of V for long: α alone says when it arrives.
 
     Args:
         dim: n >= 1.
@@ -56,10 +57,6 @@ class NeuralLyapunov(VelocityRegression):
         self.network = perceptron([self.dim, *[self.n_units] * 3, self.dim], generator)
         self.convex = InputConvex(self.dim, self.n_convex, generator)
 
-    @property
-    def plan(self) -> Plan:
-        return Plan(self.epochs, learning_rate=3e-3, n_batches=4, warm_up=0.05, clip=1.0)
-
     def normalized_velocity(self, u: Tensor) -> Tensor:
         wished = self.network(u) - self.network(torch.zeros_like(u[..., :1, :] if u.ndim > 1 else u))
         energy, slope = self._energy(u)
@@ -83,10 +80,11 @@ class NeuralLyapunov(VelocityRegression):
 
 
 class InputConvex(nn.Module):
-    """A convex function g of u, and its gradient: z₁ = s(W₀u + b₀), z₂ = s(U₁z₁ + W₁u + b₁), g = U₂z₂ + W₂u.
+    """A convex function g of u, and its gradient: z₁ = s(W₀u + b₀), z₂ = s(U₁z₁ + W₁u + b₁), g = U₂z₂.
 
-    s is softplus, convex and rising, and U >= 0 as the softplus of free weights (Amos, Xu and Kolter 2017). The gradient
-    is a sweep back through the layers, written out so that it is differentiated like any other function.
+    s is softplus, convex and rising, and U₁, U₂ >= 0 as the softplus of free weights (Amos, Xu and Kolter 2017); W₂ is
+    left out, as V takes tangents away. The gradient is a sweep back through the layers, written out so that it is
+    differentiated like any other function.
 
     Args:
         dim: n >= 1.
@@ -97,7 +95,6 @@ class InputConvex(nn.Module):
     def __init__(self, dim: int, n_units: int, generator: torch.Generator | None) -> None:
         super().__init__()
         self.direct = nn.ModuleList([linear(dim, n_units, generator), linear(dim, n_units, generator)])
-        self.slant = nn.Parameter(torch.zeros(dim, dtype=torch.float64))
         self.passed = nn.ParameterList(
             nn.Parameter(torch.randn(*shape, dtype=torch.float64, generator=generator) - math.log(n_units))
             for shape in ((n_units, n_units), (n_units,))
@@ -109,7 +106,7 @@ class InputConvex(nn.Module):
         inner, outer = softplus(self.passed[0]), softplus(self.passed[1])
         below = first(u)
         above = softplus(below) @ inner.mT + second(u)
-        value = (softplus(above) * outer).sum(-1) + (u * self.slant).sum(-1)
+        value = (softplus(above) * outer).sum(-1)
         back = outer * above.sigmoid()
-        slope = back @ second.weight + ((back @ inner) * below.sigmoid()) @ first.weight + self.slant
+        slope = back @ second.weight + ((back @ inner) * below.sigmoid()) @ first.weight
         return value, slope

@@ -17,9 +17,10 @@ from latentds.base import FitReport, StableDS
 from latentds.demonstration import Demonstration, demonstrations_of, goal_apart
 
 from .couplings import no_autocast
-from .training import Plan, descend
+from .training import Plan, Training, descend
 
-Self = TypeVar("Self", bound="VelocityRegression")
+Normal = TypeVar("Normal", bound="NormalizedDS")
+Regressing = TypeVar("Regressing", bound="VelocityRegression")
 
 
 MOST = 2000
@@ -53,16 +54,15 @@ class Pooled(NamedTuple):
         return cls((points[::every] - goal) / scale, velocities[::every] / scale * duration, goal, scale, duration)
 
 
-class VelocityRegression(StableDS):
-    """ẏ = scale ∘ f(u) / duration, u = (y - y*) / scale, with f learned from velocities by gradient.
+class NormalizedDS(StableDS):
+    """ẏ = scale ∘ f(u) / duration, u = (y - y*) / scale, with f learned from pooled velocities.
 
-    Learns from one demonstration or from several, pooled; the mean of their goals is the attractor.
-    ``fit_report.mse`` is the mean over all N n entries of the squared velocity error, (units / second)².
+    Learns from one demonstration or from several; the mean of their goals is the attractor. ``fit_report.mse`` is the
+    mean over all N n entries of the squared velocity error, (units / second)².
 
     Args:
         dim: n >= 1.
-        seed: of the initial networks and the batches; None draws them from torch's generator.
-        epochs: passes over the samples, >= 1.
+        seed: of all that a fit draws; None takes it from torch's generator.
 
     Attributes:
         scale: (n,) buffer, > 0, units of y.
@@ -72,43 +72,25 @@ class VelocityRegression(StableDS):
     scale: Tensor
     duration: Tensor
 
-    def __init__(self, dim: int, *, seed: int | None, epochs: int) -> None:
+    def __init__(self, dim: int, *, seed: int | None) -> None:
         super().__init__(dim)
         self.seed = None if seed is None else whole_number(seed, "seed", at_least=0)
-        self.epochs = whole_number(epochs, "epochs", at_least=1)
         self.register_buffer("scale", torch.ones(self.dim, dtype=torch.float64))
         self.register_buffer("duration", torch.ones((), dtype=torch.float64))
 
-    @property
     @abstractmethod
-    def plan(self) -> Plan:
-        """How ``fit`` descends."""
+    def learn(self: Normal, data: Pooled, progress: bool) -> tuple[Normal, Training]:
+        """A new system of the same settings, on whatever device and in whatever dtype, whose f has learned."""
 
     @abstractmethod
     def normalized_velocity(self, u: Tensor) -> Tensor:
         """f: (..., n) -> (..., n)."""
 
-    def fit(self: Self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> Self:
+    def fit(self: Normal, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> Normal:
         shown = demonstrations_of(demonstration, self.dim)
         began = time.perf_counter()
         data = Pooled.of(shown)
-        # A fresh system is trained, in float32, and an interrupted fit leaves self alone.
-        learner = type(self)(**self.settings).to(self.attractor.device, torch.float32)
-        points, velocities = data.points.to(learner.attractor), data.velocities.to(learner.attractor)
-        typical = velocities.square().sum(-1).mean()
-
-        def loss(batch: Tensor) -> Tensor:
-            missed = learner.normalized_velocity(points[batch]) - velocities[batch]
-            return missed.square().sum(-1).mean() / typical
-
-        training = descend(
-            loss,
-            list(learner.parameters()),
-            len(points),
-            self.plan,
-            generator=seeded_generator(self.seed),
-            progress=progress,
-        )
+        learner, training = self.learn(data, progress)  # an interrupted fit leaves self alone
         self.load_state_dict(learner.state_dict())
         with torch.no_grad():
             self.attractor.copy_(data.goal)
@@ -128,6 +110,34 @@ class VelocityRegression(StableDS):
 
     def _normalize(self, points: Tensor) -> Tensor:
         return (points - self.attractor) / self.scale
+
+
+class VelocityRegression(NormalizedDS):
+    """A :class:`NormalizedDS` whose f is made of networks and learned by gradient, in float32.
+
+    Args:
+        dim: n >= 1.
+        seed: of the initial networks and the batches; None draws them from torch's generator.
+        epochs: passes over the samples, >= 1.
+    """
+
+    def __init__(self, dim: int, *, seed: int | None, epochs: int) -> None:
+        super().__init__(dim, seed=seed)
+        self.epochs = whole_number(epochs, "epochs", at_least=1)
+
+    def learn(self: Regressing, data: Pooled, progress: bool) -> tuple[Regressing, Training]:
+        learner = type(self)(**self.settings).to(self.attractor.device, torch.float32)
+        points, velocities = data.points.to(learner.attractor), data.velocities.to(learner.attractor)
+        typical = velocities.square().sum(-1).mean()
+
+        def loss(batch: Tensor) -> Tensor:
+            missed = learner.normalized_velocity(points[batch]) - velocities[batch]
+            return missed.square().sum(-1).mean() / typical
+
+        plan = Plan(self.epochs, learning_rate=3e-3, n_batches=4, warm_up=0.05, clip=1.0)
+        generator = seeded_generator(self.seed)
+        parameters = list(learner.parameters())
+        return learner, descend(loss, parameters, len(points), plan, generator=generator, progress=progress)
 
 
 def seeded_generator(seed: int | None) -> torch.Generator | None:

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -94,7 +95,7 @@ class SDSEF(LatentDS):
         learner = SDSEF(
             self.dim, n_layers=psi.n_layers, n_features=psi.n_features, recipe=self.recipe, seed=self.seed
         ).to(self.attractor.device, torch.float32)
-        data = _Normalized.of(shown)
+        data = Normalized.of(shown)
         plan = PLANS[self.recipe]
         plan = plan if self.epochs is None else replace(plan, epochs=self.epochs)
         train = _train_tuned if self.recipe == "tuned" else _train_official
@@ -109,7 +110,7 @@ class SDSEF(LatentDS):
         return self
 
     @torch.no_grad()
-    def _place(self, data: _Normalized, shown: Sequence[Demonstration]) -> None:
+    def _place(self, data: Normalized, shown: Sequence[Demonstration]) -> None:
         """From normalised units to those of the demonstrations."""
         psi, dynamics = self.diffeomorphism, self.dynamics
         psi.center.copy_(data.center)
@@ -214,7 +215,7 @@ class NormalizedDescent(LatentDynamics):
             super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
-class _Normalized(NamedTuple):
+class Normalized(NamedTuple):
     """Demonstrations in units of their box and their mean duration; their m goals are the last points."""
 
     points: Tensor
@@ -236,7 +237,7 @@ class _Normalized(NamedTuple):
     duration: float
 
     @classmethod
-    def of(cls, shown: Sequence[Demonstration]) -> _Normalized:
+    def of(cls, shown: Sequence[Demonstration]) -> Normalized:
         goal = torch.stack([d.goal for d in shown]).mean(0)
         for d in shown:
             goal_apart(d, goal)
@@ -271,7 +272,7 @@ class _Normalized(NamedTuple):
             duration,
         )
 
-    def straightened(self, share: float) -> _Normalized:
+    def straightened(self, share: float) -> Normalized:
         """The demonstrations on their way from their chords, share 0, to themselves, share 1."""
         return self._replace(
             points=torch.lerp(self.chord_points, self.points, share),
@@ -280,10 +281,10 @@ class _Normalized(NamedTuple):
 
 
 def _train_official(
-    learner: SDSEF, data: _Normalized, plan: Plan, generator: torch.Generator | None, progress: bool
+    learner: SDSEF, data: Normalized, plan: Plan, generator: torch.Generator | None, progress: bool
 ) -> Training:
     points, velocities, goal = (part.to(learner.attractor) for part in (data.points, data.velocities, data.goal))
-    linearize, network = _linearize(learner), learner.dynamics.network
+    linearize, network = linearizer(learner.diffeomorphism), learner.dynamics.network
 
     def loss(batch: Tensor) -> Tensor:
         u = points[batch]
@@ -295,7 +296,18 @@ def _train_official(
 
 
 def _train_tuned(
-    learner: SDSEF, data: _Normalized, plan: Plan, generator: torch.Generator | None, progress: bool
+    learner: SDSEF, data: Normalized, plan: Plan, generator: torch.Generator | None, progress: bool
+) -> Training:
+    return descend_bending(partial(_tuned_loss, learner), learner, data, plan, generator, progress)
+
+
+def descend_bending(
+    loss_of: Callable[[Normalized], Callable[[Tensor], Tensor]],
+    learner: LatentDS,
+    data: Normalized,
+    plan: Plan,
+    generator: torch.Generator | None,
+    progress: bool,
 ) -> Training:
     """Continuation: a chord lies on one latent ray to begin with, and a curve that bends slowly is held there.
 
@@ -312,7 +324,7 @@ def _train_tuned(
         else:  # what the first bend leaves unlearned, no later stage has been seen to mend
             effort = replace(plan, epochs=max(1, 4 * short if stage == 1 else short), warm_up=0.3)
         training = descend(
-            _tuned_loss(learner, data.straightened(stage / stages)),
+            loss_of(data.straightened(stage / stages)),
             list(learner.parameters()),
             len(data.points) - len(data.starts),
             effort,
@@ -324,7 +336,7 @@ def _train_tuned(
     return Training(tuple(history), tuple(notes))
 
 
-def _tuned_loss(learner: SDSEF, data: _Normalized) -> Callable[[Tensor], Tensor]:
+def _tuned_loss(learner: SDSEF, data: Normalized) -> Callable[[Tensor], Tensor]:
     """2 mean(√(1 + ‖v̂-v‖²/‖v‖²) - 1) + mean(√(1 + ‖J_φ⁻¹ d / 0.05‖²) - 1) + mean ‖z/‖z‖ - e‖².
 
     e is the direction of z at the demonstrated start and d = z - max(0, z·e) e the way off the ray along it. The goals
@@ -334,7 +346,7 @@ def _tuned_loss(learner: SDSEF, data: _Normalized) -> Callable[[Tensor], Tensor]
         part.to(learner.attractor) for part in (data.points, data.velocities, data.starts, data.goal)
     )
     owner = data.owner.to(points.device)
-    linearize, network = _linearize(learner), learner.dynamics.network
+    linearize, network = linearizer(learner.diffeomorphism), learner.dynamics.network
     squared_speeds = velocities.square().sum(-1)
     squared_speeds = squared_speeds + REST**2 * squared_speeds.mean()
     anchors = torch.cat([starts, goal.unsqueeze(0)])
@@ -360,9 +372,9 @@ def _unit(z: Tensor) -> Tensor:
     return nn.functional.normalize(z, dim=-1, eps=1e-6)
 
 
-def _linearize(learner: SDSEF) -> Callable[[Tensor], tuple[Tensor, Callable[[Tensor], Tensor]]]:
-    psi = learner.diffeomorphism
-    return psi.compiled_linearize() if learner.attractor.device.type == "cpu" else psi.linearize
+def linearizer(psi: AffineCouplings) -> Callable[[Tensor], tuple[Tensor, Callable[[Tensor], Tensor]]]:
+    """The fastest ``linearize`` for training where ``psi`` is."""
+    return psi.compiled_linearize() if psi.center.device.type == "cpu" else psi.linearize
 
 
 def _stretch(r: Tensor, guard: Tensor) -> Tensor:
