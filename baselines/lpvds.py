@@ -26,6 +26,10 @@ ROUND = 0.02
 """Least eigenvalue of P whose mean eigenvalue is 1: bounds how flat its ellipsoids are."""
 DIRECTION = 0.5
 """What a unit of direction counts beside a size of the motion where samples are clustered."""
+LOCAL = 0.1
+"""Weight of each system's own misses beside the mixture's: systems that cancel on the samples run wild off them."""
+REST = 0.1
+"""Share of the mean speed below which a direction counts less."""
 LEAST_WEIGHT = 5e-3
 """Components with fewer of the samples are dropped."""
 
@@ -124,7 +128,7 @@ class LinearSystems(nn.Module):
 
 def _clustered(points: Array, velocities: Array, most: int, seed: int) -> tuple[Array, Array, Array]:
     """Weights (m,), means (m, n) and covariances (m, n, n) of positions, from a mixture of them and directions."""
-    samples = np.hstack([points, DIRECTION * _unit(velocities)])
+    samples = np.hstack([points, DIRECTION * _headings(velocities)])
     n, most = points.shape[1], min(most, len(points))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a limit of iterations: what they reached is a mixture, too
@@ -142,7 +146,7 @@ def _clustered(points: Array, velocities: Array, most: int, seed: int) -> tuple[
 def _metric(points: Array, velocities: Array) -> Array:
     """P, (n, n), of trace n, whose ellipsoids around 0 the velocities leave least."""
     cp, n = _cvxpy(), points.shape[1]
-    here, heading = _unit(points), _unit(velocities)
+    here, heading = points / np.linalg.norm(points, axis=1, keepdims=True).clip(min=1e-9), _headings(velocities)
     metric = cp.Variable((n, n), PSD=True)
     rise = (here[:, :, None] * heading[:, None, :]).reshape(len(here), -1) @ cp.vec(metric, order="C")
     cost = cp.sum(cp.pos(rise)) / len(here) + 1e-3 * cp.sum_squares(metric - np.eye(n))
@@ -154,25 +158,29 @@ def _metric(points: Array, velocities: Array) -> Array:
 def _matrices(points: Array, velocities: Array, shares: Array, metric: Array) -> Array:
     """A_k, (m, n, n), whose mixture has these velocities, by least squares under the inequality."""
     cp, (count, n) = _cvxpy(), (shares.shape[1], points.shape[1])
-    design = (shares[:, :, None] * points[:, None, :]).reshape(len(points), -1)
-    basis, triangle = np.linalg.qr(design)  # a program of as many rows as unknowns has the same minimum
     matrices = [cp.Variable((n, n)) for _ in range(count)]
-    stacked = cp.vstack([matrix.T for matrix in matrices])
-    weight = np.sqrt(len(points))
-    missed = triangle / weight @ stacked - basis.T @ velocities / weight
+    together = (shares[:, :, None] * points[:, None, :]).reshape(len(points), -1)
+    misses = [_miss(together, velocities) @ cp.vstack([*(matrix.T for matrix in matrices), -np.eye(n)])]
+    for matrix, share in zip(matrices, np.sqrt(LOCAL * shares.T)[:, :, None], strict=True):
+        misses.append(_miss(share * points, share * velocities) @ cp.vstack([matrix.T, -np.eye(n)]))
     bounds = []
     for matrix in matrices:
         pulled = metric @ matrix + matrix.T @ metric + 2 * RATE * metric
         bounds.append((pulled + pulled.T) / 2 << 0)
-    program = cp.Problem(cp.Minimize(cp.sum_squares(missed) + 1e-8 * cp.sum_squares(stacked)), bounds)
-    program.solve(solver=cp.CLARABEL)
+    cost = cp.sum([cp.sum_squares(miss) for miss in misses])
+    cp.Problem(cp.Minimize(cost / len(points)), bounds).solve(solver=cp.CLARABEL)
     return np.stack([matrix.value for matrix in matrices])
 
 
-def _unit(vectors: Array) -> Array:
-    """(N, n); 0 stays 0."""
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return vectors / np.where(lengths > 0, lengths, 1.0)
+def _miss(design: Array, velocities: Array) -> Array:
+    """(r, d + n), of as few rows as can be: times [X, -I]ᵀ it is as long as (N, d) @ X - (N, n), for every X (d, n)."""
+    return np.linalg.qr(np.hstack([design, velocities]), mode="r")
+
+
+def _headings(velocities: Array) -> Array:
+    """(N, n) of length 1, less where the motion all but rests and its direction is noise."""
+    squares = np.square(velocities).sum(1, keepdims=True)
+    return velocities / np.sqrt(squares + REST**2 * squares.mean())
 
 
 def _cvxpy() -> Any:
