@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from latentds.arguments import whole_number
 
 from .couplings import no_autocast
-from .mixture import RIDGE, GaussianMixture, drawn_seed, make_room, resize, scikit_learn
+from .mixture import GaussianMixture, drawn_seed, make_room, resize, scikit_learn
 from .networks import NormalizedDS, Pooled
 from .training import Training
 
@@ -26,8 +26,10 @@ ROUND = 0.02
 """Least eigenvalue of P whose mean eigenvalue is 1: bounds how flat its ellipsoids are."""
 DIRECTION = 0.5
 """What a unit of direction counts beside a size of the motion where samples are clustered."""
-LOCAL = 0.1
+LOCAL = 0.3
 """Weight of each system's own misses beside the mixture's: systems that cancel on the samples run wild off them."""
+BREADTH = 1e-3
+"""Least variance of a component, in squared sizes: narrower ones switch from one system to the next like a jump."""
 REST = 0.1
 """Share of the mean speed below which a direction counts less."""
 LEAST_WEIGHT = 5e-3
@@ -42,6 +44,7 @@ class LPVDS(NormalizedDS):
     the paper's physically-consistent prior is for. P from the convex program min Σ max(0, ûᵀ P v̂) over unit vectors,
     tr P = n: the ellipsoids that the demonstrations leave least. And the A_k by least squares of the velocities under
     the matrix inequality, a semidefinite program for this P (the paper's third, "P-QLF"). Both by cvxpy with clarabel.
+    Beside the mixture's own misses the program has those of each A_k where it is responsible.
 
     The inequality holds whatever the parameters are: A_k = P⁻¹(K - Kᵀ - LLᵀ) - ρI and P = RRᵀ + I/1000.
 
@@ -135,7 +138,11 @@ def _clustered(points: Array, velocities: Array, most: int, seed: int) -> tuple[
         found = (
             scikit_learn("mixture")
             .BayesianGaussianMixture(
-                n_components=most, weight_concentration_prior=1 / most, reg_covar=RIDGE, random_state=seed, max_iter=300
+                n_components=most,
+                weight_concentration_prior=1 / most,
+                reg_covar=BREADTH,
+                random_state=seed,
+                max_iter=300,
             )
             .fit(samples)
         )
@@ -146,9 +153,9 @@ def _clustered(points: Array, velocities: Array, most: int, seed: int) -> tuple[
 def _metric(points: Array, velocities: Array) -> Array:
     """P, (n, n), of trace n, whose ellipsoids around 0 the velocities leave least."""
     cp, n = _cvxpy(), points.shape[1]
-    here, heading = points / np.linalg.norm(points, axis=1, keepdims=True).clip(min=1e-9), _headings(velocities)
+    here = points / np.linalg.norm(points, axis=1, keepdims=True).clip(min=1e-9)
     metric = cp.Variable((n, n), PSD=True)
-    rise = (here[:, :, None] * heading[:, None, :]).reshape(len(here), -1) @ cp.vec(metric, order="C")
+    rise = (here[:, :, None] * _headings(velocities)[:, None, :]).reshape(len(here), -1) @ cp.vec(metric, order="C")
     cost = cp.sum(cp.pos(rise)) / len(here) + 1e-3 * cp.sum_squares(metric - np.eye(n))
     program = cp.Problem(cp.Minimize(cost), [cp.trace(metric) == n, metric >> ROUND * np.eye(n)])
     program.solve(solver=cp.CLARABEL)
