@@ -12,6 +12,8 @@ from torch import Tensor, nn
 
 from latentds.arguments import check_points, whole_number
 
+from .pooling import Pool
+
 Array = NDArray[np.float64]
 
 MOST_COMPONENTS = 12
@@ -134,6 +136,18 @@ def fit_mixture(
     ]
     best = fits[0] if len(fits) == 1 else min(fits, key=lambda fit: float(fit.bic(samples)))
     return best.weights_, best.means_, best.covariances_
+
+
+def fit_regression(pool: Pool, n_components: int | None, seed: int) -> MixtureRegression:
+    """The velocities of a pool by its points: regression by the mixture that :func:`fit_mixture` finds of both."""
+    pace = float(pool.velocities.square().mean().sqrt() / pool.points.std())
+    samples = torch.cat([pool.points, pool.velocities / pace], dim=1).numpy()
+    weights, means, covariances = fit_mixture(samples, n_components, seed)
+    dim = pool.points.shape[1]
+    units = np.concatenate([np.ones(dim), np.full(dim, pace)])
+    regression = MixtureRegression(dim)
+    regression.assign(weights, means * units, covariances * units * units[:, None])
+    return regression
 
 
 def scikit_learn(module: str) -> Any:

@@ -9,7 +9,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize
 from torch import Tensor, nn
 
 MAX_RECOVERIES = 25
@@ -136,6 +139,40 @@ def descend(
     if recoveries:
         notes.append(f"recovered from {min(recoveries, MAX_RECOVERIES)} divergences")
     return Training(tuple(history), tuple(notes))
+
+
+def descend_smoothly(loss: Callable[[], Tensor], parameters: Sequence[nn.Parameter], iterations: int) -> Training:
+    """Minimise a smooth loss of all samples at once by SciPy's L-BFGS; the parameters end where it ends.
+
+    Args:
+        loss: () -> (), of the parameters as they are; float64.
+        parameters: what to move.
+        iterations: at most, >= 1.
+    """
+    parameters, history = list(parameters), list[float]()
+    sizes = [p.numel() for p in parameters]
+
+    def assign(flat: NDArray[np.float64]) -> None:
+        _copy(parameters, [v.view_as(p) for v, p in zip(torch.from_numpy(flat).split(sizes), parameters, strict=True)])
+
+    def evaluate(flat: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        assign(flat)
+        with torch.enable_grad():
+            value = loss()
+            slopes = torch.autograd.grad(value, parameters)
+        return float(value.detach()), torch.cat([slope.flatten() for slope in slopes]).numpy()
+
+    begin = torch.cat([p.detach().flatten() for p in parameters]).numpy().copy()
+    found = minimize(
+        evaluate,
+        begin,
+        jac=True,
+        method="L-BFGS-B",
+        callback=lambda intermediate_result: history.append(float(intermediate_result.fun)),
+        options={"maxiter": iterations, "maxfun": 2 * iterations, "maxcor": 20},
+    )
+    assign(found.x)
+    return Training(tuple(history), ())
 
 
 def _adam(parameters: Sequence[nn.Parameter], plan: Plan) -> torch.optim.Adam:
