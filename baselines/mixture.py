@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,15 @@ from torch import Tensor, nn
 
 from latentds.arguments import check_points, whole_number
 
+from .pooling import Pool
+
 Array = NDArray[np.float64]
 
 MOST_COMPONENTS = 12
 """How many the Bayesian information criterion may choose from."""
+MOST_SAMPLES = 400
+"""That a mixture is fitted to, evenly chosen: neighbours in time tell nearly the same, and counted as so many witnesses
+they let the criterion choose as many components as there are to choose from."""
 RIDGE = 1e-6
 """Added to the variances of normalised samples, so that a coordinate at rest has one."""
 
@@ -136,6 +142,22 @@ def fit_mixture(
     return best.weights_, best.means_, best.covariances_
 
 
+def fit_regression(pool: Pool, n_components: int | None, seed: int) -> MixtureRegression:
+    """The velocities of a pool by its points: regression by the mixture that :func:`fit_mixture` finds of both.
+
+    ``MOST_SAMPLES`` of them are looked at, or thirty for each component.
+    """
+    pace = float(pool.velocities.square().mean().sqrt() / pool.points.std())
+    samples = torch.cat([pool.points, pool.velocities / pace], dim=1).numpy()
+    some = np.linspace(0, len(samples) - 1, min(len(samples), max(MOST_SAMPLES, 30 * (n_components or 0)))).round()
+    weights, means, covariances = fit_mixture(samples[some.astype(int)], n_components, seed)
+    dim = pool.points.shape[1]
+    units = np.concatenate([np.ones(dim), np.full(dim, pace)])
+    regression = MixtureRegression(dim)
+    regression.assign(weights, means * units, covariances * units * units[:, None])
+    return regression
+
+
 def scikit_learn(module: str) -> Any:
     """A part of scikit-learn, which only fitting needs.
 
@@ -165,9 +187,11 @@ def resize(module: nn.Module, values: dict[str, Any]) -> None:
             setattr(module, name, nn.Parameter(new.clone(), requires_grad=old.requires_grad))
 
 
-def make_room(module: nn.Module, state: dict[str, Tensor], prefix: str) -> None:
-    """Let parameters have the number of components, their first size, that a state to be loaded has."""
-    for name, held in module.named_parameters(recurse=False):
+def make_room(module: nn.Module, state: dict[str, Tensor], prefix: str, names: Sequence[str] | None = None) -> None:
+    """Let parameters, all or those named, have the first size that those of a state to be loaded have."""
+    for name, held in list(module.named_parameters(recurse=False)):
+        if names is not None and name not in names:
+            continue
         found = state.get(prefix + name)
         if found is not None and found.ndim == held.ndim and found.shape[1:] == held.shape[1:] and len(found):
             resize(module, {name: held.new_zeros(found.shape)})
