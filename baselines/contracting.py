@@ -119,9 +119,9 @@ class ContractingDynamics(LatentDynamics):
         super().__init__()
         self.n_units = whole_number(n_units, "n_units", at_least=1)
         self.rate = number_in(rate, "rate", 0, math.inf)
-        draw = {"dtype": torch.float64, "generator": generator}
-        self.weight = nn.Parameter(torch.randn(self.n_units, dim, **draw) * (2 / self.n_units) ** 0.5)
-        self.bias = nn.Parameter(torch.randn(self.n_units, **draw) * 0.5)
+        drawn = torch.randn(self.n_units, dim + 1, dtype=torch.float64, generator=generator)
+        self.weight = nn.Parameter(drawn[:, :-1] * (2 / self.n_units) ** 0.5)
+        self.bias = nn.Parameter(drawn[:, -1] * 0.5)
         self.turning = nn.Parameter(torch.zeros(dim, dim, dtype=torch.float64))
         self.register_buffer("duration", torch.ones((), dtype=torch.float64))
 

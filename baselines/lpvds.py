@@ -15,7 +15,8 @@ from latentds.arguments import whole_number
 
 from .couplings import no_autocast
 from .mixture import GaussianMixture, drawn_seed, make_room, resize, scikit_learn
-from .networks import NormalizedDS, Pooled
+from .networks import NormalizedDS
+from .pooling import Pool
 from .training import Training
 
 Array = NDArray[np.float64]
@@ -62,13 +63,13 @@ class LPVDS(NormalizedDS):
         self.mixture = GaussianMixture(self.dim)
         self.systems = LinearSystems(self.dim)
 
-    def learn(self, data: Pooled, progress: bool) -> tuple[LPVDS, Training]:
+    def learn(self, pool: Pool, progress: bool) -> tuple[LPVDS, Training]:
         learner = LPVDS(**self.settings)
-        points, velocities = data.points.numpy(), data.velocities.numpy()
+        points, velocities = pool.points.numpy(), pool.velocities.numpy()
         weights, means, covariances = _clustered(points, velocities, self.n_components, drawn_seed(self.seed))
         learner.mixture.assign(weights, means, covariances)
         with torch.no_grad():
-            shares = learner.mixture(data.points).numpy()
+            shares = learner.mixture(pool.points).numpy()
         metric = _metric(points, velocities)
         learner.systems.assign(metric, _matrices(points, velocities, shares, metric))
         return learner, Training((), (f"{len(weights)} components",))
@@ -125,7 +126,7 @@ class LinearSystems(nn.Module):
         resize(self, {"root": root, "turning": pulled / 2, "damping": vectors * values[:, None, :]})
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        make_room(self, {name: value for name, value in state_dict.items() if name != prefix + "root"}, prefix)
+        make_room(self, state_dict, prefix, ["turning", "damping"])
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
@@ -135,17 +136,10 @@ def _clustered(points: Array, velocities: Array, most: int, seed: int) -> tuple[
     n, most = points.shape[1], min(most, len(points))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a limit of iterations: what they reached is a mixture, too
-        found = (
-            scikit_learn("mixture")
-            .BayesianGaussianMixture(
-                n_components=most,
-                weight_concentration_prior=1 / most,
-                reg_covar=BREADTH,
-                random_state=seed,
-                max_iter=300,
-            )
-            .fit(samples)
+        mixture = scikit_learn("mixture").BayesianGaussianMixture(
+            n_components=most, weight_concentration_prior=1 / most, reg_covar=BREADTH, max_iter=300, random_state=seed
         )
+        found = mixture.fit(samples)
     kept = found.weights_ >= min(LEAST_WEIGHT, found.weights_.max())
     return found.weights_[kept], found.means_[kept, :n], found.covariances_[kept, :n, :n]
 
@@ -181,13 +175,14 @@ def _matrices(points: Array, velocities: Array, shares: Array, metric: Array) ->
 
 def _miss(design: Array, velocities: Array) -> Array:
     """(r, d + n), of as few rows as can be: times [X, -I]ᵀ it is as long as (N, d) @ X - (N, n), for every X (d, n)."""
-    return np.linalg.qr(np.hstack([design, velocities]), mode="r")
+    return np.asarray(np.linalg.qr(np.hstack([design, velocities]), mode="r"))
 
 
 def _headings(velocities: Array) -> Array:
     """(N, n) of length 1, less where the motion all but rests and its direction is noise."""
     squares = np.square(velocities).sum(1, keepdims=True)
-    return velocities / np.sqrt(squares + REST**2 * squares.mean())
+    headings: Array = velocities / np.sqrt(squares + REST**2 * squares.mean())
+    return headings
 
 
 def _cvxpy() -> Any:

@@ -64,7 +64,8 @@ class NeuralLyapunov(VelocityRegression):
         excess = torch.relu((slope * wished).sum(-1) + self.alpha * energy)
         flat = steepness == 0  # at the goal alone, where f̂ = 0
         pull = torch.where(flat, 0.0, excess / torch.where(flat, 1.0, steepness))
-        return wished - pull.unsqueeze(-1) * slope
+        velocity: Tensor = wished - pull.unsqueeze(-1) * slope
+        return velocity
 
     def lyapunov(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)

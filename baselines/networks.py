@@ -7,16 +7,17 @@ import time
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from latentds.arguments import whole_number
 from latentds.base import FitReport, StableDS
-from latentds.demonstration import Demonstration, demonstrations_of, goal_apart
+from latentds.demonstration import Demonstration, demonstrations_of
 
 from .couplings import no_autocast
+from .pooling import Pool
 from .training import Plan, Training, descend
 
 Normal = TypeVar("Normal", bound="NormalizedDS")
@@ -27,35 +28,8 @@ MOST = 2000
 """Samples of all demonstrations together above which only every second, third, … is taken: they lie close together."""
 
 
-class Pooled(NamedTuple):
-    """Samples of several demonstrations, in units of the box around them all and of their mean duration."""
-
-    points: Tensor
-    """(N, n), from the common goal"""
-    velocities: Tensor
-    """(N, n)"""
-    goal: Tensor
-    """(n,) the mean of their goals, in their own units"""
-    scale: Tensor
-    """(n,) extents of the box, in their own units; an axis at rest is noise, not motion, and gets a least extent"""
-    duration: float
-    """seconds"""
-
-    @classmethod
-    def of(cls, shown: Sequence[Demonstration]) -> Pooled:
-        goal = torch.stack([d.goal for d in shown]).mean(0)
-        for d in shown:
-            goal_apart(d, goal)
-        points, velocities = (torch.cat([getattr(d, part) for d in shown]) for part in ("positions", "velocities"))
-        extent = points.amax(0) - points.amin(0)
-        scale = extent.clamp(min=1e-6 * float(extent.max()))
-        duration = sum(d.duration for d in shown) / len(shown)
-        every = math.ceil(len(points) / MOST)
-        return cls((points[::every] - goal) / scale, velocities[::every] / scale * duration, goal, scale, duration)
-
-
 class NormalizedDS(StableDS):
-    """ẏ = scale ∘ f(u) / duration, u = (y - y*) / scale, with f learned from pooled velocities.
+    """ẏ = size f(u) / duration, u = (y - y*) / size, with f learned from pooled velocities.
 
     Learns from one demonstration or from several; the mean of their goals is the attractor. ``fit_report.mse`` is the
     mean over all N n entries of the squared velocity error, (units / second)².
@@ -65,21 +39,20 @@ class NormalizedDS(StableDS):
         seed: of all that a fit draws; None takes it from torch's generator.
 
     Attributes:
-        scale: (n,) buffer, > 0, units of y.
-        duration: () buffer, > 0, seconds.
+        size, duration: () buffers, > 0: the units of length and of time in which f is written.
     """
 
-    scale: Tensor
+    size: Tensor
     duration: Tensor
 
     def __init__(self, dim: int, *, seed: int | None) -> None:
         super().__init__(dim)
         self.seed = None if seed is None else whole_number(seed, "seed", at_least=0)
-        self.register_buffer("scale", torch.ones(self.dim, dtype=torch.float64))
+        self.register_buffer("size", torch.ones((), dtype=torch.float64))
         self.register_buffer("duration", torch.ones((), dtype=torch.float64))
 
     @abstractmethod
-    def learn(self: Normal, data: Pooled, progress: bool) -> tuple[Normal, Training]:
+    def learn(self: Normal, pool: Pool, progress: bool) -> tuple[Normal, Training]:
         """A new system of the same settings, on whatever device and in whatever dtype, whose f has learned."""
 
     @abstractmethod
@@ -89,13 +62,13 @@ class NormalizedDS(StableDS):
     def fit(self: Normal, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> Normal:
         shown = demonstrations_of(demonstration, self.dim)
         began = time.perf_counter()
-        data = Pooled.of(shown)
-        learner, training = self.learn(data, progress)  # an interrupted fit leaves self alone
+        pool = thinned(Pool.of(shown))
+        learner, training = self.learn(pool, progress)  # an interrupted fit leaves self alone
         self.load_state_dict(learner.state_dict())
         with torch.no_grad():
-            self.attractor.copy_(data.goal)
-            self.scale.copy_(data.scale)
-            self.duration.fill_(data.duration)
+            self.attractor.copy_(pool.goal)
+            self.size.copy_(pool.size)
+            self.duration.copy_(pool.duration)
             missed = [self(d.positions.to(self.attractor)) - d.velocities.to(self.attractor) for d in shown]
             mse = float(torch.cat(missed).square().mean())
         seconds, origins = time.perf_counter() - began, tuple(d.fingerprint for d in shown)
@@ -106,10 +79,10 @@ class NormalizedDS(StableDS):
         points, wanted = self._points(y)
         with no_autocast(points):
             velocity = self.normalized_velocity(self._normalize(points))
-        return (velocity * self.scale / self.duration).to(wanted)
+        return (velocity * self.size / self.duration).to(wanted)
 
     def _normalize(self, points: Tensor) -> Tensor:
-        return (points - self.attractor) / self.scale
+        return (points - self.attractor) / self.size
 
 
 class VelocityRegression(NormalizedDS):
@@ -125,9 +98,9 @@ class VelocityRegression(NormalizedDS):
         super().__init__(dim, seed=seed)
         self.epochs = whole_number(epochs, "epochs", at_least=1)
 
-    def learn(self: Regressing, data: Pooled, progress: bool) -> tuple[Regressing, Training]:
+    def learn(self: Regressing, pool: Pool, progress: bool) -> tuple[Regressing, Training]:
         learner = type(self)(**self.settings).to(self.attractor.device, torch.float32)
-        points, velocities = data.points.to(learner.attractor), data.velocities.to(learner.attractor)
+        points, velocities = pool.points.to(learner.attractor), pool.velocities.to(learner.attractor)
         typical = velocities.square().sum(-1).mean()
 
         def loss(batch: Tensor) -> Tensor:
@@ -138,6 +111,12 @@ class VelocityRegression(NormalizedDS):
         generator = seeded_generator(self.seed)
         parameters = list(learner.parameters())
         return learner, descend(loss, parameters, len(points), plan, generator=generator, progress=progress)
+
+
+def thinned(pool: Pool) -> Pool:
+    """Every second, third, … sample of a pool of more than ``MOST``."""
+    stride = math.ceil(len(pool.points) / MOST)
+    return pool._replace(points=pool.points[::stride], velocities=pool.velocities[::stride])
 
 
 def seeded_generator(seed: int | None) -> torch.Generator | None:
