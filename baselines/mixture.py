@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import random
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,8 +23,9 @@ MOST_COMPONENTS = 12
 MOST_SAMPLES = 400
 """That a mixture is fitted to, evenly chosen: neighbours in time tell nearly the same, and counted as so many witnesses
 they let the criterion choose as many components as there are to choose from."""
-RIDGE = 1e-6
-"""Added to the variances of normalised samples, so that a coordinate at rest has one."""
+RIDGE = 1e-4
+"""Added to the variances of normalised samples: a hundredth of a size, so that a single demonstration, of no width, does
+not make a field that changes within its own width."""
 
 
 class GaussianMixture(nn.Module):
@@ -164,10 +166,13 @@ def scikit_learn(module: str) -> Any:
     Raises:
         ImportError: without it; the message says how to install it.
     """
+    state = random.getstate()  # which the first import of it moves
     try:
         return importlib.import_module(f"sklearn.{module}")
     except ImportError as error:
         raise ImportError("Gaussian mixtures need scikit-learn: pip install 'latentds[field]'") from error
+    finally:
+        random.setstate(state)
 
 
 def drawn_seed(seed: int | None) -> int:

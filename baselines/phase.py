@@ -77,7 +77,7 @@ class PhaseDriven(StableDS):
 
     def forward(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
-        s = torch.linspace(0, 1, NODES).to(self.attractor)
+        s = torch.arange(NODES).to(self.attractor) / NODES
         path = torch.cat([self.motion(self.start, 0.0, s), self.attractor.unsqueeze(0)])
         velocities = torch.cat([self.velocity(s), torch.zeros_like(self.attractor).unsqueeze(0)])
         with torch.no_grad():  # not by matrix products, whose rounding differs from batch to batch
@@ -90,10 +90,11 @@ class PhaseDriven(StableDS):
             squared = step.square().sum(-1).clamp(min=torch.finfo(step.dtype).tiny)
             share.append((((points - path[first]) * step).sum(-1) / squared).clamp(0, 1).unsqueeze(-1))
             apart.append((points - path[first] - share[-1] * step).square().sum(-1, keepdim=True))
-        first = torch.where(apart[1] < apart[0], node.clamp(max=NODES - 1).unsqueeze(-1), node.clamp(min=1).unsqueeze(-1) - 1)
-        along = torch.where(apart[1] < apart[0], share[1], share[0])
-        here, there = velocities[first.squeeze(-1)], velocities[first.squeeze(-1) + 1]
-        return ((here + along * (there - here)) / self.duration).to(wanted)
+        later = (apart[1] < apart[0]).squeeze(-1)
+        first = torch.where(later, node.clamp(max=NODES - 1), node.clamp(min=1) - 1)
+        along = torch.where(later.unsqueeze(-1), share[1], share[0])
+        velocity = torch.lerp(velocities[first], velocities[first + 1], along) / self.duration
+        return velocity.to(wanted)
 
     def lyapunov(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)

@@ -20,6 +20,8 @@ from .training import descend_smoothly
 SLOWEST = 0.05
 """Least rate at which every linear system approaches the goal, in units of 1 / duration: a strict inequality's margin."""
 
+FASTEST = 20.0
+"""Largest such rate to begin with: across a single path the regression knows none, and says anything."""
 STEPS = {"spins": 2.0, "pulls": 2.0, "mixture.log_heights": 1.0, "mixture.means": 0.1, "mixture.whiteners": 5.0}
 """How far a parameter goes for a change that shows, in sizes and durations."""
 PRIOR = 1e-3
@@ -125,7 +127,7 @@ class StableSystems(nn.Module):
         """The stable systems nearest to the linear parts of a regression, with its mixture."""
         slopes = regression.slopes
         values, vectors = np.linalg.eigh((slopes + slopes.mT).numpy() / 2)
-        roots = np.sqrt(np.maximum(-values - SLOWEST, SLOWEST))  # at 0 no gradient would reach it
+        roots = np.sqrt(np.clip(-values - SLOWEST, SLOWEST, FASTEST))  # at 0 no gradient would reach it
         self.mixture.load_state_dict(regression.mixture.state_dict())
         resize(self, {"spins": (slopes - slopes.mT) / 4, "pulls": vectors * roots[:, None, :]})
 
