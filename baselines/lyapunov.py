@@ -17,6 +17,10 @@ QUADRATIC = 1e-2
 """ε, weight of ‖u‖² in V, which makes it positive and unbounded whatever was learned."""
 
 
+KINK = 5.0
+"""Width, in αV, over which the corner of relu is rounded."""
+
+
 class NeuralLyapunov(VelocityRegression):
     """f = f̂ - ∇V relu(∇V·f̂ + αV) / ‖∇V‖², so that V̇ <= -αV everywhere (Manek and Kolter 2019, sec. 3.2).
 
@@ -26,7 +30,8 @@ class NeuralLyapunov(VelocityRegression):
     Where this differs from the paper, and why. Its V = σ(g(u) - g(0)) + ε‖u‖², σ a smooth rectifier, is flat wherever
     g lies below g(0), and training stays there; taking away the tangent at 0 gives the same functions, those convex
     and least at 0, without that trap. Its f̂(0) need not be 0, and f then jumps at the goal; ours is an equilibrium, and
-    f Lipschitz there too. f has kinks where the projection sets in.
+    f Lipschitz there too. Its relu makes kinks where the projection sets in; ours is rounded from above, so that V̇ <= -αV
+    as before, by a width that falls with V.
 
     Where nothing was shown, a motion may run along the level sets of V for long: α alone says when it arrives.
 
@@ -55,15 +60,16 @@ class NeuralLyapunov(VelocityRegression):
         self.alpha = number_in(alpha, "alpha", 0, math.inf)
         generator = seeded_generator(self.seed)
         self.network = perceptron([self.dim, *[self.n_units] * 3, self.dim], generator)
-        self.convex = InputConvex(self.dim, self.n_convex, generator)
+        self.bowl = Bowl(self.dim, self.n_convex, generator)
 
     def normalized_velocity(self, u: Tensor) -> Tensor:
         wished = self.network(u) - self.network(torch.zeros_like(u[..., :1, :] if u.ndim > 1 else u))
         energy, slope = self._energy(u)
-        steepness = slope.square().sum(-1)
-        excess = torch.relu((slope * wished).sum(-1) + self.alpha * energy)
-        flat = steepness == 0  # at the goal alone, where f̂ = 0
-        pull = torch.where(flat, 0.0, excess / torch.where(flat, 1.0, steepness))
+        steepness, least = slope.square().sum(-1), self.alpha * energy
+        flat = (steepness == 0) | (least == 0)  # at the goal, where f̂ = 0
+        steepness, least = torch.where(flat, 1.0, steepness), torch.where(flat, 1.0, least)
+        excess = (slope * wished).sum(-1) + least
+        pull = torch.where(flat, 0.0, (excess + torch.hypot(excess, KINK * least)) / 2 / steepness)
         velocity: Tensor = wished - pull.unsqueeze(-1) * slope
         return velocity
 
@@ -74,18 +80,16 @@ class NeuralLyapunov(VelocityRegression):
 
     def _energy(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """V and ∇V at u: (..., n) -> (...), (..., n)."""
-        value, slope = self.convex(u)
-        level, tilt = self.convex(torch.zeros_like(self.attractor))
-        energy = value - level - (u * tilt).sum(-1) + QUADRATIC * u.square().sum(-1)
-        return energy, slope - tilt + 2 * QUADRATIC * u
+        value, slope = self.bowl(u)
+        return value + QUADRATIC * u.square().sum(-1), slope + 2 * QUADRATIC * u
 
 
-class InputConvex(nn.Module):
-    """A convex function g of u, and its gradient: z₁ = s(W₀u + b₀), z₂ = s(U₁z₁ + W₁u + b₁), g = U₂z₂.
+class Bowl(nn.Module):
+    """g(u) - g(0) - ∇g(0)·u and its gradient, g = U₂ s(U₁ s(W₀u + b₀) + W₁u + b₁) convex: >= 0, and 0 at 0.
 
-    s is softplus, convex and rising, and U₁, U₂ >= 0 as the softplus of free weights (Amos, Xu and Kolter 2017); W₂ is
-    left out, as V takes tangents away. The gradient is a sweep back through the layers, written out so that it is
-    differentiated like any other function.
+    s is softplus, convex and rising, and U₁, U₂ >= 0 as the softplus of free weights (Amos, Xu and Kolter 2017). All is
+    told by differences from 0, so that little is lost to rounding near it, and the gradient is a sweep back through the
+    layers, written out so that it is differentiated like any other function.
 
     Args:
         dim: n >= 1.
@@ -105,9 +109,20 @@ class InputConvex(nn.Module):
         """(..., n) -> (...), (..., n)."""
         first, second = self.direct
         inner, outer = softplus(self.passed[0]), softplus(self.passed[1])
-        below = first(u)
-        above = softplus(below) @ inner.mT + second(u)
-        value = (softplus(above) * outer).sum(-1)
-        back = outer * above.sigmoid()
-        slope = back @ second.weight + ((back @ inner) * below.sigmoid()) @ first.weight
-        return value, slope
+        below_there = first.bias
+        below = u @ first.weight.mT
+        risen = _rise(below_there, below)
+        above_there = softplus(below_there) @ inner.mT + second.bias
+        above = risen @ inner.mT + u @ second.weight.mT
+        tilt, steep = outer * above_there.sigmoid(), outer * (above_there + above).sigmoid()
+        bent = risen - below_there.sigmoid() * below
+        value = ((_rise(above_there, above) - above_there.sigmoid() * above) * outer).sum(-1) + bent @ (tilt @ inner)
+        sunk = (steep @ inner) * (below_there + below).sigmoid() - (tilt @ inner) * below_there.sigmoid()
+        return value, (steep - tilt) @ second.weight + sunk @ first.weight
+
+
+def _rise(there: Tensor, step: Tensor) -> Tensor:
+    """softplus(there + step) - softplus(there), as precise as its value is small."""
+    small = step.clamp(-1, 1)
+    near = torch.log1p(there.sigmoid() * torch.expm1(small))
+    return torch.where(step == small, near, softplus(there + step) - softplus(there))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch.nn.functional import softplus
 
 import latentds
-from baselines.lyapunov import InputConvex, NeuralLyapunov
+from baselines.lyapunov import Bowl, NeuralLyapunov
 from latentds.testing import parametrize_stable_ds, wavy_motion
 
 
@@ -35,11 +36,20 @@ def places(fitted, draw):
     return fitted.attractor + 3 * torch.randn(500, 3, generator=draw, dtype=torch.float64)
 
 
-def test_the_gradient_written_out_is_autograds(draw):
-    convex = InputConvex(3, 7, draw)
-    u = torch.randn(20, 3, generator=draw, dtype=torch.float64)
-    slopes = torch.func.vmap(torch.func.grad(lambda row: convex(row)[0]))(u)
-    torch.testing.assert_close(convex(u)[1], slopes)
+def test_the_bowl_is_a_convex_network_without_its_tangent(draw):
+    """Written plainly, and differentiated by autograd."""
+    bowl = Bowl(3, 7, draw)
+    u = 3 * torch.randn(20, 3, generator=draw, dtype=torch.float64)
+
+    def network(row):
+        (first, second), (inner, outer) = bowl.direct, map(softplus, bowl.passed)
+        return outer @ softplus(inner @ softplus(first(row)) + second(row))
+
+    zero = torch.zeros(3, dtype=torch.float64)
+    height, tilt = network(zero), torch.func.grad(network)(zero)
+    value, slope = bowl(u)
+    torch.testing.assert_close(value, torch.stack([network(row) - height - tilt @ row for row in u]))
+    torch.testing.assert_close(slope, torch.stack([torch.func.grad(network)(row) - tilt for row in u]))
 
 
 def test_v_is_convex(fitted, places):
