@@ -17,8 +17,14 @@ from latentds.integrate import integrate
 
 from .couplings import AffineCouplings, no_autocast
 from .networks import seeded_generator
-from .sdsef import REST, Normalized, descend_bending, linearizer
+from .sdsef import BEND, REST, Normalized, descend_bending, linearizer
 from .training import Plan
+
+
+WINDOW = 0.2
+"""Length of the motions that are learned from, in durations."""
+STEPS = 8
+"""In which they are integrated."""
 
 
 class NCDS(LatentDS):
@@ -79,7 +85,7 @@ class NCDS(LatentDS):
         plan = Plan(self.epochs, learning_rate=2e-3, n_batches=4, warm_up=0.05, clip=1.0, slack=0.3)
 
         def loss_of(bent: Normalized) -> Callable[[Tensor], Tensor]:
-            return _velocity_loss(learner, bent)
+            return _loss(learner, bent)
 
         training = descend_bending(loss_of, learner, data, plan, seeded_generator(self.seed), progress)
         self.load_state_dict(learner.state_dict())
@@ -144,16 +150,51 @@ class ContractingDynamics(LatentDynamics):
         return self.rate / float(self.duration) if finite and self.duration > 0 else -math.inf
 
 
-def _velocity_loss(learner: NCDS, data: Normalized) -> Callable[[Tensor], Tensor]:
-    """2 mean(√(1 + ‖v̂ - v‖²/‖v‖²) - 1)."""
-    points, velocities, goal = (part.to(learner.attractor) for part in (data.points, data.velocities, data.goal))
+def _loss(learner: NCDS, data: Normalized) -> Callable[[Tensor], Tensor]:
+    """2 mean(√(1 + ‖v̂ - v‖²/‖v‖²) - 1) + mean(√(1 + ‖J_φ⁻¹ e / 0.05‖²) - 1).
+
+    e is how far a latent motion from a sample is off the sample that comes ``WINDOW`` later.
+    """
+    points, velocities, clock, goal = (
+        part.to(learner.attractor) for part in (data.points, data.velocities, data.clock, data.goal)
+    )
     linearize = linearizer(learner.diffeomorphism)
     squared_speeds = velocities.square().sum(-1)
     squared_speeds = squared_speeds + REST**2 * squared_speeds.mean()
+    later = _later(data)
 
     def loss(batch: Tensor) -> Tensor:
-        x, push = linearize(torch.cat([points[batch], goal.unsqueeze(0)]))
-        missed = push(learner.dynamics.pull(x, x[-1]))[:-1] - velocities[batch]
-        return 2 * torch.mean((1 + missed.square().sum(-1) / squared_speeds[batch]).sqrt() - 1)
+        some = batch[: len(batch) // 2 + 1]
+        there = later[some]
+        x, push = linearize(torch.cat([points[batch], points[there], goal.unsqueeze(0)]))
+        x_goal, n = x[-1], len(batch)
+        pulled = learner.dynamics.pull(x[:n], x_goal)
+        moved = _moved(learner.dynamics, x[: len(some)], (clock[there] - clock[some]).unsqueeze(-1), x_goal)
+        pushed = push(torch.cat([pulled, moved - x[n:-1], torch.zeros_like(x[-1:])]))
+        missed = (pushed[:n] - velocities[batch]).square().sum(-1) / squared_speeds[batch]
+        off = (pushed[n:-1] / BEND).square().sum(-1)
+        return 2 * torch.mean((1 + missed).sqrt() - 1) + torch.mean((1 + off).sqrt() - 1)
 
     return loss
+
+
+def _later(data: Normalized) -> Tensor:
+    """(N,) index of the sample of the same demonstration that comes ``WINDOW`` later, or of its goal."""
+    later = torch.empty(len(data.points), dtype=torch.long)
+    for i in range(len(data.starts)):
+        own = (data.owner == i).nonzero()[:, 0]
+        times = data.clock[own].contiguous()
+        later[own] = own[torch.searchsorted(times, times + WINDOW).clamp(max=len(own) - 1)]
+    return later
+
+
+def _moved(dynamics: ContractingDynamics, x: Tensor, t: Tensor, goal: Tensor) -> Tensor:
+    """Where motions from x, (b, n), are after times t, (b, 1), by ``STEPS`` classical Runge-Kutta steps."""
+    h = t / STEPS
+    for _ in range(STEPS):
+        first = dynamics.pull(x, goal)
+        second = dynamics.pull(x + h / 2 * first, goal)
+        third = dynamics.pull(x + h / 2 * second, goal)
+        fourth = dynamics.pull(x + h * third, goal)
+        x = x + h / 6 * (first + 2 * second + 2 * third + fourth)
+    return x

@@ -17,10 +17,6 @@ QUADRATIC = 1e-2
 """ε, weight of ‖u‖² in V, which makes it positive and unbounded whatever was learned."""
 
 
-KINK = 5.0
-"""Width, in αV, over which the corner of relu is rounded."""
-
-
 class NeuralLyapunov(VelocityRegression):
     """f = f̂ - ∇V relu(∇V·f̂ + αV) / ‖∇V‖², so that V̇ <= -αV everywhere (Manek and Kolter 2019, sec. 3.2).
 
@@ -30,8 +26,8 @@ class NeuralLyapunov(VelocityRegression):
     Where this differs from the paper, and why. Its V = σ(g(u) - g(0)) + ε‖u‖², σ a smooth rectifier, is flat wherever
     g lies below g(0), and training stays there; taking away the tangent at 0 gives the same functions, those convex
     and least at 0, without that trap. Its f̂(0) need not be 0, and f then jumps at the goal; ours is an equilibrium, and
-    f Lipschitz there too. Its relu makes kinks where the projection sets in; ours is rounded from above, so that V̇ <= -αV
-    as before, by a width that falls with V.
+    f Lipschitz there too. f has
+    kinks where the projection sets in.
 
     Where nothing was shown, a motion may run along the level sets of V for long: α alone says when it arrives.
 
@@ -67,9 +63,8 @@ class NeuralLyapunov(VelocityRegression):
         energy, slope = self._energy(u)
         steepness, least = slope.square().sum(-1), self.alpha * energy
         flat = (steepness == 0) | (least == 0)  # at the goal, where f̂ = 0
-        steepness, least = torch.where(flat, 1.0, steepness), torch.where(flat, 1.0, least)
-        excess = (slope * wished).sum(-1) + least
-        pull = torch.where(flat, 0.0, (excess + torch.hypot(excess, KINK * least)) / 2 / steepness)
+        steepness = torch.where(flat, 1.0, steepness)
+        pull = torch.where(flat, 0.0, torch.relu((slope * wished).sum(-1) + least) / steepness)
         velocity: Tensor = wished - pull.unsqueeze(-1) * slope
         return velocity
 

@@ -228,6 +228,8 @@ class Normalized(NamedTuple):
     """(N, n)"""
     owner: Tensor
     """(N,) which demonstration"""
+    clock: Tensor
+    """(N,) since its start"""
     starts: Tensor
     """(m, n)"""
     goal: Tensor
@@ -254,17 +256,18 @@ class Normalized(NamedTuple):
             progress = torch.cat([steps[:1] * 0, steps.cumsum(0)]) / length
             rate = velocities.norm(dim=-1) / length
             chords = points[0] + progress.unsqueeze(-1) * chord, rate.unsqueeze(-1) * chord
-            columns.append((points, velocities, *chords, torch.full((len(d),), i)))
+            columns.append((points, velocities, *chords, torch.full((len(d),), i), d.times / duration))
         last = torch.cat([torch.arange(len(d)) == len(d) - 1 for d in shown]).to(torch.uint8).argsort(stable=True)
         starts = torch.stack([(d.start - center) / scale for d in shown])
         samples = [torch.cat(column)[last] for column in zip(*columns, strict=True)]
-        points, velocities, chord_points, chord_velocities, owner = samples
+        points, velocities, chord_points, chord_velocities, owner, clock = samples
         return cls(
             points,
             velocities,
             chord_points,
             chord_velocities,
             owner,
+            clock,
             starts,
             (goal - center) / scale,
             center,
