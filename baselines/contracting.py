@@ -17,14 +17,8 @@ from latentds.integrate import integrate
 
 from .couplings import AffineCouplings, no_autocast
 from .networks import seeded_generator
-from .sdsef import BEND, REST, Normalized, descend_bending, linearizer
+from .sdsef import Normalized, descend_bending, ray_loss
 from .training import Plan
-
-
-WINDOW = 0.2
-"""Length of the motions that are learned from, in durations."""
-STEPS = 8
-"""In which they are integrated."""
 
 
 class NCDS(LatentDS):
@@ -84,8 +78,11 @@ class NCDS(LatentDS):
         data = Normalized.of(shown)
         plan = Plan(self.epochs, learning_rate=2e-3, n_batches=4, warm_up=0.05, clip=1.0, slack=0.3)
 
+        def pull(u: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+            return learner.dynamics.pull(z), torch.ones_like(z[:, :1])
+
         def loss_of(bent: Normalized) -> Callable[[Tensor], Tensor]:
-            return _loss(learner, bent)
+            return ray_loss(learner.diffeomorphism, pull, bent)
 
         training = descend_bending(loss_of, learner, data, plan, seeded_generator(self.seed), progress)
         self.load_state_dict(learner.state_dict())
@@ -104,9 +101,9 @@ class NCDS(LatentDS):
 
 
 class ContractingDynamics(LatentDynamics):
-    """ẋ = -Wᵀ(tanh(Wx + b) - tanh(Wx* + b)) - ε(x - x*) + S(x - x*), S skew, in units of the duration.
+    """ẋ = -Wᵀ(tanh(Wz + b) - tanh(b)) - εz + Sz, z = x - x*, S skew, in units of the duration.
 
-    Its Jacobian is -(JᵀJ + εI) + S with J = diag(√(1 - tanh²(Wx + b))) W, so ‖x - z‖ of any two motions falls at least
+    Its Jacobian is -(JᵀJ + εI) + S with J = diag(√(1 - tanh²(Wz + b))) W, so ‖x - z‖ of any two motions falls at least
     at the rate ε.
 
     Args:
@@ -132,15 +129,14 @@ class ContractingDynamics(LatentDynamics):
         self.register_buffer("duration", torch.ones((), dtype=torch.float64))
 
     def forward(self, x: Tensor, y: Tensor, frame: Frame) -> Tensor:
-        return self.pull(x, frame.attractor) / self.duration
+        return self.pull(x - frame.attractor) / self.duration
 
-    def pull(self, x: Tensor, goal: Tensor) -> Tensor:
-        """ẋ per duration: (..., n), (n,) -> (..., n)."""
-        with no_autocast(x):
-            offset = x - goal
-            linear = self.turning - self.turning.mT - self.rate * torch.eye(len(goal)).to(goal)
-            risen = torch.tanh(x @ self.weight.mT + self.bias) - torch.tanh(self.weight @ goal + self.bias)
-            return offset @ linear.mT - risen @ self.weight
+    def pull(self, z: Tensor) -> Tensor:
+        """ẋ per duration at x* + z: (..., n) -> (..., n)."""
+        with no_autocast(z):
+            linear = self.turning - self.turning.mT - self.rate * torch.eye(z.shape[-1]).to(z)
+            risen = torch.tanh(z @ self.weight.mT + self.bias) - torch.tanh(self.bias)
+            return z @ linear.mT - risen @ self.weight
 
     def flow(self, x: Tensor, t: Tensor, frame: Frame) -> Tensor:
         return integrate(lambda states: self(states, states, frame), x, t, frame.attractor)
@@ -148,53 +144,3 @@ class ContractingDynamics(LatentDynamics):
     def convergence_rate_bound(self, radius: float, frame: Frame) -> float:
         finite = all(bool(torch.isfinite(part).all()) for part in self.state_dict().values())
         return self.rate / float(self.duration) if finite and self.duration > 0 else -math.inf
-
-
-def _loss(learner: NCDS, data: Normalized) -> Callable[[Tensor], Tensor]:
-    """2 mean(√(1 + ‖v̂ - v‖²/‖v‖²) - 1) + mean(√(1 + ‖J_φ⁻¹ e / 0.05‖²) - 1).
-
-    e is how far a latent motion from a sample is off the sample that comes ``WINDOW`` later.
-    """
-    points, velocities, clock, goal = (
-        part.to(learner.attractor) for part in (data.points, data.velocities, data.clock, data.goal)
-    )
-    linearize = linearizer(learner.diffeomorphism)
-    squared_speeds = velocities.square().sum(-1)
-    squared_speeds = squared_speeds + REST**2 * squared_speeds.mean()
-    later = _later(data)
-
-    def loss(batch: Tensor) -> Tensor:
-        some = batch[: len(batch) // 2 + 1]
-        there = later[some]
-        x, push = linearize(torch.cat([points[batch], points[there], goal.unsqueeze(0)]))
-        x_goal, n = x[-1], len(batch)
-        pulled = learner.dynamics.pull(x[:n], x_goal)
-        moved = _moved(learner.dynamics, x[: len(some)], (clock[there] - clock[some]).unsqueeze(-1), x_goal)
-        pushed = push(torch.cat([pulled, moved - x[n:-1], torch.zeros_like(x[-1:])]))
-        missed = (pushed[:n] - velocities[batch]).square().sum(-1) / squared_speeds[batch]
-        off = (pushed[n:-1] / BEND).square().sum(-1)
-        return 2 * torch.mean((1 + missed).sqrt() - 1) + torch.mean((1 + off).sqrt() - 1)
-
-    return loss
-
-
-def _later(data: Normalized) -> Tensor:
-    """(N,) index of the sample of the same demonstration that comes ``WINDOW`` later, or of its goal."""
-    later = torch.empty(len(data.points), dtype=torch.long)
-    for i in range(len(data.starts)):
-        own = (data.owner == i).nonzero()[:, 0]
-        times = data.clock[own].contiguous()
-        later[own] = own[torch.searchsorted(times, times + WINDOW).clamp(max=len(own) - 1)]
-    return later
-
-
-def _moved(dynamics: ContractingDynamics, x: Tensor, t: Tensor, goal: Tensor) -> Tensor:
-    """Where motions from x, (b, n), are after times t, (b, 1), by ``STEPS`` classical Runge-Kutta steps."""
-    h = t / STEPS
-    for _ in range(STEPS):
-        first = dynamics.pull(x, goal)
-        second = dynamics.pull(x + h / 2 * first, goal)
-        third = dynamics.pull(x + h / 2 * second, goal)
-        fourth = dynamics.pull(x + h * third, goal)
-        x = x + h / 6 * (first + 2 * second + 2 * third + fourth)
-    return x

@@ -228,8 +228,6 @@ class Normalized(NamedTuple):
     """(N, n)"""
     owner: Tensor
     """(N,) which demonstration"""
-    clock: Tensor
-    """(N,) since its start"""
     starts: Tensor
     """(m, n)"""
     goal: Tensor
@@ -256,18 +254,17 @@ class Normalized(NamedTuple):
             progress = torch.cat([steps[:1] * 0, steps.cumsum(0)]) / length
             rate = velocities.norm(dim=-1) / length
             chords = points[0] + progress.unsqueeze(-1) * chord, rate.unsqueeze(-1) * chord
-            columns.append((points, velocities, *chords, torch.full((len(d),), i), d.times / duration))
+            columns.append((points, velocities, *chords, torch.full((len(d),), i)))
         last = torch.cat([torch.arange(len(d)) == len(d) - 1 for d in shown]).to(torch.uint8).argsort(stable=True)
         starts = torch.stack([(d.start - center) / scale for d in shown])
         samples = [torch.cat(column)[last] for column in zip(*columns, strict=True)]
-        points, velocities, chord_points, chord_velocities, owner, clock = samples
+        points, velocities, chord_points, chord_velocities, owner = samples
         return cls(
             points,
             velocities,
             chord_points,
             chord_velocities,
             owner,
-            clock,
             starts,
             (goal - center) / scale,
             center,
@@ -287,7 +284,7 @@ def _train_official(
     learner: SDSEF, data: Normalized, plan: Plan, generator: torch.Generator | None, progress: bool
 ) -> Training:
     points, velocities, goal = (part.to(learner.attractor) for part in (data.points, data.velocities, data.goal))
-    linearize, network = linearizer(learner.diffeomorphism), learner.dynamics.network
+    linearize, network = _linearize(learner), learner.dynamics.network
 
     def loss(batch: Tensor) -> Tensor:
         u = points[batch]
@@ -340,16 +337,30 @@ def descend_bending(
 
 
 def _tuned_loss(learner: SDSEF, data: Normalized) -> Callable[[Tensor], Tensor]:
+    def descent(u: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+        return _unit(z), -learner.dynamics.network(u).exp()
+
+    return ray_loss(learner.diffeomorphism, descent, data)
+
+
+def ray_loss(
+    psi: AffineCouplings, field: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], data: Normalized
+) -> Callable[[Tensor], Tensor]:
     """2 mean(√(1 + ‖v̂-v‖²/‖v‖²) - 1) + mean(√(1 + ‖J_φ⁻¹ d / 0.05‖²) - 1) + mean ‖z/‖z‖ - e‖².
 
     e is the direction of z at the demonstrated start and d = z - max(0, z·e) e the way off the ray along it. The goals
     themselves have no direction and are left out.
+
+    Args:
+        psi: φ⁻¹, of which z = φ(u) - φ(goal).
+        field: u and z, (b, n) each -> a latent velocity, (b, n), and a factor, (b, 1), which v̂ = J_φ⁻¹ (…) has, too.
+        data: the demonstrations.
     """
     points, velocities, starts, goal = (
-        part.to(learner.attractor) for part in (data.points, data.velocities, data.starts, data.goal)
+        part.to(psi.center) for part in (data.points, data.velocities, data.starts, data.goal)
     )
     owner = data.owner.to(points.device)
-    linearize, network = linearizer(learner.diffeomorphism), learner.dynamics.network
+    linearize = psi.compiled_linearize() if points.device.type == "cpu" else psi.linearize
     squared_speeds = velocities.square().sum(-1)
     squared_speeds = squared_speeds + REST**2 * squared_speeds.mean()
     anchors = torch.cat([starts, goal.unsqueeze(0)])
@@ -358,14 +369,14 @@ def _tuned_loss(learner: SDSEF, data: Normalized) -> Callable[[Tensor], Tensor]:
         u, v, n = points[batch], velocities[batch], len(batch)
         x, push = linearize(torch.cat([u, anchors]))
         z = x - x[-1]
-        heading = _unit(z)
-        ray = heading[n:-1][owner[batch]]
+        ray = _unit(z[n:-1])[owner[batch]]
         aside = z[:n] - (z[:n] * ray).sum(-1, keepdim=True).clamp(min=0) * ray
-        aside = torch.cat([aside, torch.zeros_like(anchors)])
-        flow, away = push(torch.stack([heading, aside]))[:, :n]
-        error = (-network(u).exp() * flow - v).square().sum(-1) / squared_speeds[batch]
+        latent, factor = field(u, z[:n])
+        rest = torch.zeros_like(anchors)
+        flow, away = push(torch.stack([torch.cat([latent, rest]), torch.cat([aside, rest])]))[:, :n]
+        error = (factor * flow - v).square().sum(-1) / squared_speeds[batch]
         bend = (away / BEND).square().sum(-1)
-        turn = (heading[:n] - ray).square().sum(-1)
+        turn = (_unit(z[:n]) - ray).square().sum(-1)
         return torch.mean(2 * ((1 + error).sqrt() - 1) + (1 + bend).sqrt() - 1 + turn)
 
     return loss
@@ -375,9 +386,9 @@ def _unit(z: Tensor) -> Tensor:
     return nn.functional.normalize(z, dim=-1, eps=1e-6)
 
 
-def linearizer(psi: AffineCouplings) -> Callable[[Tensor], tuple[Tensor, Callable[[Tensor], Tensor]]]:
-    """The fastest ``linearize`` for training where ``psi`` is."""
-    return psi.compiled_linearize() if psi.center.device.type == "cpu" else psi.linearize
+def _linearize(learner: SDSEF) -> Callable[[Tensor], tuple[Tensor, Callable[[Tensor], Tensor]]]:
+    psi = learner.diffeomorphism
+    return psi.compiled_linearize() if learner.attractor.device.type == "cpu" else psi.linearize
 
 
 def _stretch(r: Tensor, guard: Tensor) -> Tensor:
