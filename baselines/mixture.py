@@ -23,8 +23,8 @@ MOST_COMPONENTS = 12
 MOST_SAMPLES = 400
 """That a mixture is fitted to, evenly chosen: neighbours in time tell nearly the same, and counted as so many witnesses
 they let the criterion choose as many components as there are to choose from."""
-RIDGE = 1e-4
-"""Added to the variances of normalised samples: a hundredth of a size, so that a single demonstration, of no width, does
+RIDGE = 1e-3
+"""Added to the variances of normalised samples: a thirtieth of a size, so that a single demonstration, of no width, does
 not make a field that changes within its own width."""
 
 
