@@ -12,7 +12,7 @@ from latentds.arguments import whole_number
 from latentds.base import FitReport, StableDS
 from latentds.demonstration import Demonstration, demonstrations_of
 
-from .mixture import MixtureRegression, drawn_seed, fit_regression
+from .mixture import MixtureRegression, drawn_seed, fit_regression, nearby
 from .pooling import Pool
 from .training import descend_smoothly
 
@@ -129,7 +129,7 @@ class CLFDM(StableDS):
     def _velocity(self, z: Tensor) -> Tensor:
         """In sizes per duration at z, in sizes from the goal: (..., n) -> (..., n)."""
         fading = -torch.expm1(-z.square().sum(-1, keepdim=True) / (2 * REACH**2))
-        wish = fading * self.regression(z)
+        wish = fading * self.regression(z, nearby(z))
         speed = torch.linalg.vector_norm(wish, dim=-1, keepdim=True)
         wish = wish / (1 + (speed / (HASTE * self.pace)) ** 4) ** 0.25
         slope = self.energy.gradient(z)

@@ -12,7 +12,7 @@ from latentds.arguments import whole_number
 from latentds.base import FitReport, StableDS
 from latentds.demonstration import Demonstration, demonstrations_of
 
-from .mixture import GaussianMixture, drawn_seed, fit_regression, make_room, resize
+from .mixture import GaussianMixture, drawn_seed, fit_regression, make_room, nearby, resize
 from .pooling import Pool
 from .training import descend_smoothly
 
@@ -36,10 +36,9 @@ class SEDS(StableDS):
     γ are the responsibilities of a Gaussian mixture over positions, and V(y) = ‖y - y*‖² falls along every motion, so
     that no motion that leads away from the goal first can be learned. The objective is the paper's second one, the
     mean squared error of the velocities, which follows better than the likelihood. The constraint is kept by
-    parametrisation, A_k = S_k - S_kᵀ - R_k R_kᵀ - ε I, so that nothing is left to constrain: from where Gaussian
-    mixture regression of the velocities lies, made stable, L-BFGS moves S and R, then the mixture too. The authors'
-    code constrains a general solver instead, and its linear maps are also those of a joint mixture, which the error
-    does not ask for.
+    parametrisation, A_k = S_k - S_kᵀ - R_k R_kᵀ - ε I, so that nothing is left to constrain: with the mixture that EM
+    finds of positions and velocities L-BFGS moves S and R, then the mixture too. The authors' code constrains a general
+    solver instead, and its linear maps are also those of a joint mixture, which the error does not ask for.
 
     Learns from one demonstration or from several, pooled; their goals' mean is the attractor. ``fit_report.mse`` is the
     mean over all N n entries of the squared velocity error, (units / second)²; ``n_layers`` is K.
@@ -139,7 +138,7 @@ class StableSystems(nn.Module):
 
     def forward(self, z: Tensor) -> Tensor:
         values = (self.slopes() * z.unsqueeze(-2).unsqueeze(-2)).sum(-1)
-        mixed: Tensor = (self.mixture(z).unsqueeze(-1) * values).sum(-2) - SLOWEST * z
+        mixed: Tensor = (self.mixture(nearby(z)).unsqueeze(-1) * values).sum(-2) - SLOWEST * z
         return mixed
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: object) -> None:
