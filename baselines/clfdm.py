@@ -16,14 +16,14 @@ from .mixture import MixtureRegression, drawn_seed, fit_regression, nearby
 from .pooling import Pool
 from .training import descend_smoothly
 
-RATE = 0.5
-"""α: V falls at least by α V a duration, so that whatever the regression says a motion from one size away is within a
-hundredth of it after 20 durations."""
+RATE = 1.0
+"""α: V falls at least by α V a duration, so that whatever the regression says a motion is within a hundredth of its way
+after ten."""
 REACH = 0.02
 """Sizes around the goal within which the regression, which is not 0 there, is led to 0."""
-HASTE = 4.0
+HASTE = 2.0
 """Times the largest demonstrated speed that f approaches where its linear maps, far from where they were learned, would
-be faster; what was shown it changes by a thousandth."""
+be faster; what was shown it changes by less than a thousandth."""
 FLATTEST = 1e-2
 """Least eigenvalue of the quadratic part of V, whose others are about 1."""
 REWARD = 1e-4
@@ -94,7 +94,8 @@ class CLFDM(StableDS):
 
         def rises() -> Tensor:
             slopes = energy.gradient(points)
-            return (slopes * headings).sum(-1) / torch.linalg.vector_norm(slopes, dim=-1)
+            cosines: Tensor = (slopes * headings).sum(-1) / torch.linalg.vector_norm(slopes, dim=-1)
+            return cosines
 
         def loss() -> Tensor:
             rise = rises()
@@ -131,7 +132,7 @@ class CLFDM(StableDS):
         fading = -torch.expm1(-z.square().sum(-1, keepdim=True) / (2 * REACH**2))
         wish = fading * self.regression(z, nearby(z))
         speed = torch.linalg.vector_norm(wish, dim=-1, keepdim=True)
-        wish = wish / (1 + (speed / (HASTE * self.pace)) ** 4) ** 0.25
+        wish = wish / (1 + (speed / (HASTE * self.pace)) ** 8) ** 0.125
         slope = self.energy.gradient(z)
         excess = (slope * wish).sum(-1) + RATE * self.energy(z)
         steep = slope.square().sum(-1).clamp(min=torch.finfo(z.dtype).tiny)

@@ -26,8 +26,8 @@ MOST_SAMPLES = 400
 """That a mixture is fitted to, evenly chosen: neighbours in time tell nearly the same, and counted as so many witnesses
 they let the criterion choose as many components as there are to choose from."""
 RIDGE = 1e-3
-"""Added to the variances of normalised samples: a thirtieth of a size, so that a single demonstration, of no width, does
-not make a field that changes within its own width."""
+"""Added to the variances of normalised samples: a thirtieth of a size, so that a single demonstration, of no width,
+does not make a field that changes within its own width."""
 
 
 class GaussianMixture(nn.Module):
@@ -114,7 +114,7 @@ class MixtureRegression(nn.Module):
 
     def forward(self, x: Tensor, seen_at: Tensor | None = None) -> Tensor:
         """(..., n) -> (..., n); the responsibilities are those ``seen_at`` other places (..., n) if these are given."""
-        shares = self.mixture(x if seen_at is None else seen_at).unsqueeze(-1)
+        shares: Tensor = self.mixture(x if seen_at is None else seen_at).unsqueeze(-1)
         values = (self.slopes * x.unsqueeze(-2).unsqueeze(-2)).sum(-1) + self.offsets
         mixed: Tensor = (shares * values).sum(-2)
         return mixed
@@ -131,7 +131,8 @@ def nearby(z: Tensor) -> Tensor:
     those of the nearby place is as good there and can be integrated.
     """
     distance = torch.linalg.vector_norm(z, dim=-1, keepdim=True).clamp(min=FAR)
-    return z * (FAR / distance)
+    near: Tensor = z * (FAR / distance)
+    return near
 
 
 def fit_mixture(

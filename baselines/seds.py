@@ -17,7 +17,7 @@ from .pooling import Pool
 from .training import descend_smoothly
 
 SLOWEST = 0.05
-"""Least rate at which every linear system approaches the goal, in units of 1 / duration: a strict inequality's margin."""
+"""Least rate at which every linear system approaches the goal, in 1 / duration: the margin of a strict inequality."""
 
 PACE = 2.0
 """The rate of every linear system in directions that no demonstration tells of: across a single path, all of them."""
@@ -79,7 +79,8 @@ class SEDS(StableDS):
         unit = pool.velocities.square().mean()
 
         def error() -> Tensor:
-            return (learner(pool.points) - pool.velocities).square().mean() / unit
+            missed: Tensor = learner(pool.points) - pool.velocities
+            return missed.square().mean() / unit
 
         def plain_loss() -> Tensor:
             return error() + LEAN * (learner.slopes() + PACE * torch.eye(self.dim).double()).square().sum()
@@ -87,7 +88,9 @@ class SEDS(StableDS):
         def loss() -> Tensor:
             return plain_loss() + PRIOR * sum(((p - known) / steps[p]).square().sum() for p, known in before.items())
 
-        history = descend_smoothly(plain_loss, {p: step for p, step in steps.items() if p not in before}, self.iterations)
+        history = descend_smoothly(
+            plain_loss, {p: step for p, step in steps.items() if p not in before}, self.iterations
+        )
         history += descend_smoothly(loss, steps, self.iterations)
         self.systems.load_state_dict(learner.state_dict())
         with torch.no_grad():
