@@ -78,7 +78,7 @@ class ProMP(PhaseDriven):
     def velocity(self, s: Tensor) -> Tensor:
         return self._conditioned(self.start, 0.0, basis(self.n_basis, s)[1])
 
-    def _conditioned(self, y: Tensor, since: float, values: Tensor, *) -> Tensor:
+    def _conditioned(self, y: Tensor, since: float, values: Tensor) -> Tensor:
         """What φ (T, B), or its derivative, makes of the weights given y (..., n) at ``since`` and the goal at 1."""
         if not since < 1:
             raise ValueError(f"since: expected a time before the motion ends, got {since:g} of its duration")
