@@ -12,15 +12,18 @@ from latentds.arguments import whole_number
 from latentds.base import FitReport, StableDS
 from latentds.demonstration import Demonstration, demonstrations_of
 
-from .mixture import MixtureRegression, drawn_seed, fit_regression
+from .mixture import MixtureRegression, drawn_seed, fit_regression, nearby
 from .pooling import Pool
 from .training import descend_smoothly
 
-RATE = 0.5
-"""α: V falls at least by α V a duration, so that whatever the regression says a motion from one size away is within a
-hundredth of it after 20 durations."""
+RATE = 1.0
+"""α: V falls at least by α V a duration, so that whatever the regression says a motion is within a hundredth of its way
+after ten."""
 REACH = 0.02
 """Sizes around the goal within which the regression, which is not 0 there, is led to 0."""
+HASTE = 2.0
+"""Times the largest demonstrated speed that f approaches where its linear maps, far from where they were learned, would
+be faster; what was shown it changes by less than a thousandth."""
 FLATTEST = 1e-2
 """Least eigenvalue of the quadratic part of V, whose others are about 1."""
 REWARD = 1e-4
@@ -32,10 +35,10 @@ class CLFDM(StableDS):
 
     V is a weighted sum of asymmetric quadratic functions, learned from the directions of the demonstrated velocities
     alone; f is Gaussian mixture regression of the velocities; and u = -∇V max(0, ∇V·f + ρ)/‖∇V‖², the least that gives
-    V̇ <= -ρ. Where the demonstrations descend V, f is left as it is. Three things are our own: all matrices are positive
+    V̇ <= -ρ. Where the demonstrations descend V, f is left as it is. Four things are our own: all matrices are positive
     by parametrisation, so that L-BFGS learns V without constraints; the margin is ρ = α V, which grows without bound
     and makes V fall exponentially; and f fades to 0 at the goal within ``REACH`` sizes of it, without which the field
-    would jump there.
+    would jump there, and grows no faster than ``HASTE`` demonstrated speeds.
 
     Learns from one demonstration or from several, pooled; their goals' mean is the attractor. ``fit_report.mse`` is the
     mean over all N n entries of the squared velocity error, (units / second)²; ``n_layers`` is the mixture's K; the
@@ -51,10 +54,12 @@ class CLFDM(StableDS):
 
     Attributes:
         size, duration: () buffers: the units of length and of time in which V and f are written.
+        pace: () buffer, the largest demonstrated speed in these units.
     """
 
     size: Tensor
     duration: Tensor
+    pace: Tensor
 
     def __init__(
         self,
@@ -72,6 +77,7 @@ class CLFDM(StableDS):
         self.seed = None if seed is None else whole_number(seed, "seed", at_least=0)
         self.register_buffer("size", torch.ones((), dtype=torch.float64))
         self.register_buffer("duration", torch.ones((), dtype=torch.float64))
+        self.register_buffer("pace", torch.ones((), dtype=torch.float64))
         self.energy = AsymmetricQuadratics(self.dim, self.n_asymmetric)
         self.regression = MixtureRegression(self.dim)
 
@@ -88,7 +94,8 @@ class CLFDM(StableDS):
 
         def rises() -> Tensor:
             slopes = energy.gradient(points)
-            return (slopes * headings).sum(-1) / torch.linalg.vector_norm(slopes, dim=-1)
+            cosines: Tensor = (slopes * headings).sum(-1) / torch.linalg.vector_norm(slopes, dim=-1)
+            return cosines
 
         def loss() -> Tensor:
             rise = rises()
@@ -102,6 +109,7 @@ class CLFDM(StableDS):
             self.attractor.copy_(pool.goal)
             for name in ("size", "duration"):
                 self.get_buffer(name).copy_(getattr(pool, name))
+            self.pace.copy_(speeds.max())
             missed = self._velocity(pool.points.to(self.attractor)) - pool.velocities.to(self.attractor)
             mse = float(missed.square().mean() * (pool.size / pool.duration) ** 2)
         notes = (f"V rises along {share:.1%} of the demonstrated samples, where it bends the motion",) if share else ()
@@ -122,7 +130,9 @@ class CLFDM(StableDS):
     def _velocity(self, z: Tensor) -> Tensor:
         """In sizes per duration at z, in sizes from the goal: (..., n) -> (..., n)."""
         fading = -torch.expm1(-z.square().sum(-1, keepdim=True) / (2 * REACH**2))
-        wish = fading * self.regression(z)
+        wish = fading * self.regression(z, nearby(z))
+        speed = torch.linalg.vector_norm(wish, dim=-1, keepdim=True)
+        wish = wish / (1 + (speed / (HASTE * self.pace)) ** 8) ** 0.125
         slope = self.energy.gradient(z)
         excess = (slope * wish).sum(-1) + RATE * self.energy(z)
         steep = slope.square().sum(-1).clamp(min=torch.finfo(z.dtype).tiny)

@@ -20,12 +20,14 @@ Array = NDArray[np.float64]
 
 MOST_COMPONENTS = 12
 """How many the Bayesian information criterion may choose from."""
+FAR = 2.0
+"""Sizes from the goal beyond which nothing was demonstrated."""
 MOST_SAMPLES = 400
 """That a mixture is fitted to, evenly chosen: neighbours in time tell nearly the same, and counted as so many witnesses
 they let the criterion choose as many components as there are to choose from."""
-RIDGE = 1e-4
-"""Added to the variances of normalised samples: a hundredth of a size, so that a single demonstration, of no width, does
-not make a field that changes within its own width."""
+RIDGE = 1e-3
+"""Added to the variances of normalised samples: a thirtieth of a size, so that a single demonstration, of no width,
+does not make a field that changes within its own width."""
 
 
 class GaussianMixture(nn.Module):
@@ -110,9 +112,9 @@ class MixtureRegression(nn.Module):
         offsets = means[:, n:] - np.einsum("kij,kj->ki", slopes, means[:, :n])
         resize(self, {"slopes": slopes, "offsets": offsets})
 
-    def forward(self, x: Tensor) -> Tensor:
-        """(..., n) -> (..., n)."""
-        shares = self.mixture(x).unsqueeze(-1)
+    def forward(self, x: Tensor, seen_at: Tensor | None = None) -> Tensor:
+        """(..., n) -> (..., n); the responsibilities are those ``seen_at`` other places (..., n) if these are given."""
+        shares: Tensor = self.mixture(x if seen_at is None else seen_at).unsqueeze(-1)
         values = (self.slopes * x.unsqueeze(-2).unsqueeze(-2)).sum(-1) + self.offsets
         mixed: Tensor = (shares * values).sum(-2)
         return mixed
@@ -120,6 +122,17 @@ class MixtureRegression(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         make_room(self, state_dict, prefix)
         super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+def nearby(z: Tensor) -> Tensor:
+    """z (..., n), or where the way there from 0 leaves the ball of radius ``FAR``: (..., n).
+
+    Far from all Gaussians their responsibilities change from 0 to 1 within less and less of a size. A field mixed by
+    those of the nearby place is as good there and can be integrated.
+    """
+    distance = torch.linalg.vector_norm(z, dim=-1, keepdim=True).clamp(min=FAR)
+    near: Tensor = z * (FAR / distance)
+    return near
 
 
 def fit_mixture(

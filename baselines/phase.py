@@ -24,8 +24,8 @@ class PhaseDriven(StableDS):
 
     So two things are one in the methods of this library and are not in these.
 
-    * :meth:`rollout` carries the phase: it begins at phase 0 wherever it begins, and goes through the whole motion. Paths
-      cross, and a motion begun anew half-way is another one; :meth:`resume` goes on at a later phase.
+    * :meth:`rollout` carries the phase: it begins at phase 0 wherever it begins, and goes through the whole motion.
+      Paths cross, and a motion begun anew half-way is another one; :meth:`resume` goes on at a later phase.
     * :meth:`forward` has no phase to carry. It answers with the velocity of the motion from the demonstrated start at
       the phase where that is nearest to y, and with 0 from where the goal is nearest. That is a fair reading on the
       demonstrated path, and no more than a reading off it: no rollout is its integral, and nothing brings it to the

@@ -69,15 +69,16 @@ class ProMP(PhaseDriven):
     def _weights(self, shown: Demonstration) -> Tensor:
         values, _ = basis(self.n_basis, shown.times / shown.duration)
         normal = values.mT @ values + RIDGE * len(values) * torch.eye(self.n_basis, dtype=torch.float64)
-        return torch.linalg.solve(normal, values.mT @ (shown.positions - shown.goal)) + shown.goal
+        solved: Tensor = torch.linalg.solve(normal, values.mT @ (shown.positions - shown.goal))
+        return solved + shown.goal
 
     def motion(self, y: Tensor, since: float, s: Tensor, *, at_rest: bool = False) -> Tensor:
         return self._conditioned(y, since, basis(self.n_basis, s.clamp(max=1.0))[0])
 
     def velocity(self, s: Tensor) -> Tensor:
-        return self._conditioned(self.start, 0.0, basis(self.n_basis, s)[1], derivative=True)
+        return self._conditioned(self.start, 0.0, basis(self.n_basis, s)[1])
 
-    def _conditioned(self, y: Tensor, since: float, values: Tensor, *, derivative: bool = False) -> Tensor:
+    def _conditioned(self, y: Tensor, since: float, values: Tensor) -> Tensor:
         """What φ (T, B), or its derivative, makes of the weights given y (..., n) at ``since`` and the goal at 1."""
         if not since < 1:
             raise ValueError(f"since: expected a time before the motion ends, got {since:g} of its duration")
@@ -87,7 +88,7 @@ class ProMP(PhaseDriven):
         between = self._covariance(ends, ends)
         gain = torch.linalg.solve(between, self._covariance(ends, values))  # symmetric, so that its transpose is wanted
         moved: Tensor = (gain.mT * surprise.unsqueeze(-2)).sum(-1)
-        return (values @ self.mean) + moved.unflatten(-1, (len(values), self.dim))
+        return values @ self.mean + moved.reshape(*y.shape[:-1], len(values), self.dim)
 
     def _covariance(self, one: Tensor, other: Tensor) -> Tensor:
         """Of the positions that φ (A, B) and φ (C, B) make: (A n, C n)."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -13,15 +12,17 @@ from latentds.arguments import whole_number
 from latentds.base import FitReport, StableDS
 from latentds.demonstration import Demonstration, demonstrations_of
 
-from .mixture import GaussianMixture, MixtureRegression, drawn_seed, fit_regression, make_room, resize
+from .mixture import GaussianMixture, drawn_seed, fit_regression, make_room, nearby, resize
 from .pooling import Pool
 from .training import descend_smoothly
 
 SLOWEST = 0.05
-"""Least rate at which every linear system approaches the goal, in units of 1 / duration: a strict inequality's margin."""
+"""Least rate at which every linear system approaches the goal, in 1 / duration: the margin of a strict inequality."""
 
-FASTEST = 20.0
-"""Largest such rate to begin with: across a single path the regression knows none, and says anything."""
+PACE = 2.0
+"""The rate of every linear system in directions that no demonstration tells of: across a single path, all of them."""
+LEAN = 1e-5
+"""Weight of what says so, the squared entries of A_k + ``PACE`` I."""
 STEPS = {"spins": 2.0, "pulls": 2.0, "mixture.log_heights": 1.0, "mixture.means": 0.1, "mixture.whiteners": 5.0}
 """How far a parameter goes for a change that shows, in sizes and durations."""
 PRIOR = 1e-3
@@ -35,10 +36,9 @@ class SEDS(StableDS):
     γ are the responsibilities of a Gaussian mixture over positions, and V(y) = ‖y - y*‖² falls along every motion, so
     that no motion that leads away from the goal first can be learned. The objective is the paper's second one, the
     mean squared error of the velocities, which follows better than the likelihood. The constraint is kept by
-    parametrisation, A_k = S_k - S_kᵀ - R_k R_kᵀ - ε I, so that nothing is left to constrain: from where Gaussian
-    mixture regression of the velocities lies, made stable, L-BFGS moves S and R, then the mixture too. The authors'
-    code constrains a general solver instead, and its linear maps are also those of a joint mixture, which the error
-    does not ask for.
+    parametrisation, A_k = S_k - S_kᵀ - R_k R_kᵀ - ε I, so that nothing is left to constrain: with the mixture that EM
+    finds of positions and velocities L-BFGS moves S and R, then the mixture too. The authors' code constrains a general
+    solver instead, and its linear maps are also those of a joint mixture, which the error does not ask for.
 
     Learns from one demonstration or from several, pooled; their goals' mean is the attractor. ``fit_report.mse`` is the
     mean over all N n entries of the squared velocity error, (units / second)²; ``n_layers`` is K.
@@ -72,19 +72,25 @@ class SEDS(StableDS):
         shown = demonstrations_of(demonstration, self.dim)
         began = time.perf_counter()
         pool, learner = Pool.of(shown), StableSystems(self.dim)
-        learner.assign(fit_regression(pool, self.n_components, drawn_seed(self.seed)))
+        learner.assign(fit_regression(pool, self.n_components, drawn_seed(self.seed)).mixture)
 
         steps = {learner.get_parameter(name): step for name, step in STEPS.items()}
         before = {parameter: parameter.detach().clone() for parameter in learner.mixture.parameters()}
         unit = pool.velocities.square().mean()
 
         def error() -> Tensor:
-            return (learner(pool.points) - pool.velocities).square().mean() / unit
+            missed: Tensor = learner(pool.points) - pool.velocities
+            return missed.square().mean() / unit
+
+        def plain_loss() -> Tensor:
+            return error() + LEAN * (learner.slopes() + PACE * torch.eye(self.dim).double()).square().sum()
 
         def loss() -> Tensor:
-            return error() + PRIOR * sum(((p - known) / steps[p]).square().sum() for p, known in before.items())
+            return plain_loss() + PRIOR * sum(((p - known) / steps[p]).square().sum() for p, known in before.items())
 
-        history = descend_smoothly(error, {p: step for p, step in steps.items() if p not in before}, self.iterations)
+        history = descend_smoothly(
+            plain_loss, {p: step for p, step in steps.items() if p not in before}, self.iterations
+        )
         history += descend_smoothly(loss, steps, self.iterations)
         self.systems.load_state_dict(learner.state_dict())
         with torch.no_grad():
@@ -123,18 +129,19 @@ class StableSystems(nn.Module):
         self.pulls = nn.Parameter(torch.eye(dim, dtype=torch.float64)[None].clone())
 
     @torch.no_grad()
-    def assign(self, regression: MixtureRegression) -> None:
-        """The stable systems nearest to the linear parts of a regression, with its mixture."""
-        slopes = regression.slopes
-        values, vectors = np.linalg.eigh((slopes + slopes.mT).numpy() / 2)
-        roots = np.sqrt(np.clip(-values - SLOWEST, SLOWEST, FASTEST))  # at 0 no gradient would reach it
-        self.mixture.load_state_dict(regression.mixture.state_dict())
-        resize(self, {"spins": (slopes - slopes.mT) / 4, "pulls": vectors * roots[:, None, :]})
+    def assign(self, mixture: GaussianMixture) -> None:
+        """Every linear system alike, with this mixture."""
+        self.mixture.load_state_dict(mixture.state_dict())
+        eye = torch.eye(mixture.dim, dtype=torch.float64).expand(mixture.n_components, -1, -1)
+        resize(self, {"spins": torch.zeros_like(eye), "pulls": PACE**0.5 * eye})
+
+    def slopes(self) -> Tensor:
+        """A_k + ε I, (K, n, n)."""
+        return self.spins - self.spins.mT - self.pulls @ self.pulls.mT
 
     def forward(self, z: Tensor) -> Tensor:
-        slopes = self.spins - self.spins.mT - self.pulls @ self.pulls.mT
-        values = (slopes * z.unsqueeze(-2).unsqueeze(-2)).sum(-1)
-        mixed: Tensor = (self.mixture(z).unsqueeze(-1) * values).sum(-2) - SLOWEST * z
+        values = (self.slopes() * z.unsqueeze(-2).unsqueeze(-2)).sum(-1)
+        mixed: Tensor = (self.mixture(nearby(z)).unsqueeze(-1) * values).sum(-2) - SLOWEST * z
         return mixed
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: object) -> None:

@@ -161,7 +161,7 @@ def descend_smoothly(
     steps = torch.cat([torch.full((p.numel(),), step, dtype=p.dtype) for p, step in parameters.items()])
 
     def assign(flat: NDArray[np.float64]) -> None:
-        values = (torch.from_numpy(flat) * steps).split(sizes)
+        values = torch.split(torch.from_numpy(flat) * steps, sizes)
         _copy(moved, [value.view_as(p) for value, p in zip(values, moved, strict=True)])
 
     def evaluate(flat: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:

@@ -9,6 +9,7 @@ import torch
 from sklearn.mixture import GaussianMixture as Reference
 
 from baselines.mixture import GaussianMixture, MixtureRegression, fit_mixture
+from baselines.training import descend_smoothly
 
 
 @pytest.fixture(scope="module")
@@ -53,3 +54,14 @@ def test_a_state_of_more_components_loads(samples):
     x = torch.from_numpy(samples[:, :2])
     assert torch.equal(fresh(x), fitted(x))
     assert fresh.mixture.n_components == 4
+
+
+def test_smooth_descent_finds_the_minimum_of_a_narrow_valley():
+    place = torch.nn.Parameter(torch.tensor([-1.2, 1.0], dtype=torch.float64))
+    history = descend_smoothly(lambda: rosen(place), {place: 0.5}, 200)
+    np.testing.assert_allclose(place.detach(), [1, 1], atol=1e-3)
+    assert history[-1] < 1e-6 < history[0]
+
+
+def rosen(x):
+    return 100 * (x[1] - x[0] ** 2) ** 2 + (1 - x[0]) ** 2
