@@ -32,7 +32,7 @@ from .kernels.dispatch import no_active_transforms
 from .memory import Memo, tensors_of
 from .wrappers import Similarity, check_rotation
 
-FORMAT = 2
+FORMAT = 3
 """Of the files of systems; raised when they change so that another latentds would misread them."""
 
 Self = TypeVar("Self", bound="StableDS")
@@ -52,6 +52,7 @@ class FitReport:
             follow the demonstration).
         learned_from: name and SHA-256 of each demonstration.
         fidelity: how the fitted system follows what it was shown, measured after every fit, whatever the method.
+        columns: names of the coordinates, from the demonstrations; () if they have none. Filled in by the system.
         state: SHA-256 of the system's state after the fit, to the precision of float32; filled in by the system.
     """
 
@@ -62,6 +63,7 @@ class FitReport:
     notes: tuple[str, ...] = ()
     learned_from: tuple[tuple[str, str], ...] = ()
     fidelity: Fidelity | None = None
+    columns: tuple[str, ...] = ()
     state: str = ""
 
 
@@ -335,8 +337,11 @@ def _fit(fit: Callable[..., Any], ds: StableDS, args: tuple[Any, ...], kwargs: d
 
 def _hold_against(ds: StableDS, demonstration: Any) -> tuple[str, ...]:
     """Put into the report how ``ds`` follows its demonstration; what is off."""
+    columns: tuple[str, ...] = ()
     try:
-        fidelity = measure(ds, Excerpt.of_each(demonstrations_of(demonstration, ds.dim)))
+        shown = demonstrations_of(demonstration, ds.dim)
+        columns = next((one.columns for one in shown if one.columns), ())
+        fidelity = measure(ds, Excerpt.of_each(shown))
         notes = fidelity.notes
     except Exception as error:  # a method's own rollout may raise anything; the fit itself is done and stays
         fidelity, notes = None, (f"could not be measured, {type(error).__name__}: {error}",)
@@ -344,7 +349,7 @@ def _hold_against(ds: StableDS, demonstration: Any) -> tuple[str, ...]:
     if isinstance(report, FitReport):
         told = () if report.fidelity is None else report.fidelity.notes
         before = tuple(note for note in report.notes if note not in told)
-        ds.fit_report = replace(report, fidelity=fidelity, notes=before + notes)
+        ds.fit_report = replace(report, fidelity=fidelity, notes=before + notes, columns=columns)
     return notes
 
 

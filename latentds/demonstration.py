@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from . import files, recordings
+from . import files, readers, recordings
 from .arguments import point_array, positive, real_array
 
 logger = logging.getLogger(__name__)
@@ -34,7 +34,7 @@ class Demonstration:
             kept as a float64 CPU tensor. The last point is the goal.
         dt: seconds between two points, > 0.
         name: a label for tables and pictures.
-        columns: n names of the coordinates, or none.
+        columns: n names of the coordinates, or none. A fit keeps them in ``fit_report.columns``, pictures show them.
         origin: one line that says what a recording's columns were taken for; empty if it was not read from one.
 
     Raises:
@@ -57,6 +57,8 @@ class Demonstration:
         columns = tuple(self.columns) if isinstance(self.columns, (list, tuple)) else (None,)
         if columns and (len(columns) != positions.shape[1] or not all(isinstance(c, str) for c in columns)):
             raise ValueError(f"columns: expected {positions.shape[1]} names, got {self.columns!r}")
+        if len(set(columns)) < len(columns):
+            raise ValueError(f"columns: expected names that differ, got {columns!r}")
         object.__setattr__(self, "columns", columns)
         object.__setattr__(self, "positions", torch.from_numpy(positions))
         object.__setattr__(self, "dt", dt)
@@ -173,7 +175,7 @@ class Demonstration:
             FileNotFoundError: if there is no such file.
         """
         path = Path(path)
-        table = recordings.read_table(path)
+        table = readers.read_table(path)
         if name is None:
             saved = table.get("name", np.array(0))
             name = str(saved) if saved.ndim == 0 and saved.dtype.kind == "U" else path.stem
@@ -192,7 +194,7 @@ class Demonstration:
         name: str = "",
     ) -> Demonstration:
         """What :meth:`load` does, for a pandas frame or a mapping from names to arrays that is at hand already."""
-        known = recordings.as_table(table)
+        known = readers.as_table(table)
         motion = recordings.understand(known, name or "the table", columns=columns, time=time, unit=unit, dt=dt)
         return cls._of(motion, name)
 
@@ -232,12 +234,26 @@ def demonstrations_of(demonstration: Any, dim: int) -> list[Demonstration]:
     for item in found:
         if item.dim != dim:
             raise ValueError(f"demonstration: expected dimension {dim}, got {item.dim} ({item!r})")
+    named = list({item.columns: None for item in found if item.columns})
+    if len(named) > 1:
+        raise ValueError(f"demonstration: expected the same columns in all, got {named[0]} and {named[1]}")
     return list(found)
 
 
-def jitter(positions: NDArray[np.float64]) -> float:
-    """Length of the noise in a recording (N, n), read off its second differences: in the units of the positions."""
-    return float(np.median(np.linalg.norm(np.diff(positions, 2, axis=0), axis=1)) / math.sqrt(6))
+def arc_lengths(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Length of the polygon through points (N, n) up to each of them, from 0: (N,)."""
+    lengths: NDArray[np.float64] = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(lengths)])
+
+
+def jitter(positions: NDArray[np.float64], order: int = 2) -> float:
+    """Length of the noise in a recording (N, n), in the units of the positions.
+
+    Read off its differences of that order k, N > k, in which a motion like a polynomial of a lower degree does not
+    show: those of white noise of standard deviation s have s √C(2k, k).
+    """
+    differences = np.linalg.norm(np.diff(positions, order, axis=0), axis=1)
+    return float(np.median(differences)) / math.sqrt(math.comb(2 * order, order))
 
 
 def goal_apart(shown: Demonstration, goal: Tensor) -> float:

@@ -72,8 +72,8 @@ def replications(demonstration: Demonstration, paths: Mapping[str, Any], title: 
         gone = int((~np.all(inside, axis=1)).sum())
         note = f"\n{gone} of {len(batch)} leave the picture" if gone else ""
         axes.set_title(label + note, color=color_of(label) if i else SHOWN, fontsize=11)
-        for axis, bounds in zip("xyz", zip(low, high, strict=True), strict=False):
-            axes.set(**{f"{axis}lim": bounds, f"{axis}label": axis})
+        for axis, label, bounds in zip("xyz", _labels(demonstration), zip(low, high, strict=True), strict=False):
+            axes.set(**{f"{axis}lim": bounds, f"{axis}label": label})
             getattr(axes, f"{axis}axis").set_major_locator(MaxNLocator(4, prune="both"))
         _quiet(axes)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
@@ -117,7 +117,8 @@ def vector_field(
     axes.plot(*shown.T, color=SHOWN, lw=2, ls="--", label="demonstration")
     axes.plot(*shown[0], "o", color=SHOWN, ms=6, label="start")
     axes.plot(*shown[-1], "*", color="#E69F00", mec=SHOWN, ms=15, label="goal")
-    axes.set(xlim=(left, right), ylim=(bottom, top), xlabel="x", ylabel="y", title=demonstration.name)
+    first, second = _labels(demonstration)
+    axes.set(xlim=(left, right), ylim=(bottom, top), xlabel=first, ylabel=second, title=demonstration.name)
     axes.set_aspect("equal")
     figure.legend(loc="outside lower center", ncols=4, fontsize=9, frameon=False)
     return figure
@@ -185,13 +186,22 @@ def joints(demonstration: Demonstration, paths: Mapping[str, Any], title: str = 
             for i, path in enumerate(batch):
                 name = label if k == i == 0 else ""
                 axes.plot(times, path[:, k], dashes, color=color_of(label), lw=1.2, label=name)
-        axes.set_ylabel(f"$y_{{{k + 1}}}$ [{unit}]")
+        axes.set_ylabel(f"{_labels(demonstration)[k]} [{unit}]")
         axes.grid(color="#EEEEEE", lw=0.6)
         axes.spines[["top", "right"]].set_visible(False)
     rows[-1].set_xlabel("time [s]")
     figure.legend(loc="outside lower center", ncols=len(moved) + 1, fontsize=9, frameon=False)
     figure.align_ylabels(list(rows))
     return figure
+
+
+def _labels(demonstration: Demonstration) -> tuple[str, ...]:
+    """What to write at the axes: the names of the columns, or x, y, z, or numbers."""
+    if demonstration.columns:
+        return tuple(name.replace("$", r"\$") for name in demonstration.columns)  # no formula
+    return tuple(
+        "xyz"[: demonstration.dim] if demonstration.dim <= 3 else (f"$y_{{{k + 1}}}$" for k in range(demonstration.dim))
+    )
 
 
 def _moved(paths: Mapping[str, Any], demonstration: Demonstration) -> dict[str, Array]:

@@ -5,6 +5,7 @@ The system that wraps another, MovedDS, is in ``base``: every system makes one o
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,7 @@ class Similarity(nn.Module):
     def fetch_motion(self, shown: Demonstration, before: Tensor, after: Tensor) -> Demonstration:
         """The demonstration z(t) that becomes ``shown``."""
         own = [part.to(self.rotation) for part in (shown.positions, before, after)]
-        return Demonstration(self.fetch(*own), shown.dt * float(self.speed), shown.name)
+        return replace(shown, positions=self.fetch(*own), dt=shown.dt * float(self.speed))
 
     def carry_excerpt(self, shown: Excerpt, before: Tensor, after: Tensor) -> Excerpt:
         """What becomes of an excerpt of a demonstration z(t)."""

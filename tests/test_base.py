@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import copy
 import pickle
+from dataclasses import replace
 
 import pytest
 import torch
 
+import latentds
 from baselines import FDM, SDSEF
+from latentds import ChebyshevDS, TubeDS, datasets
 from latentds.kernels.dispatch import reference
 from latentds.testing import wavy_motion
 
@@ -227,3 +230,26 @@ def test_half_precision_is_refused_and_answered(ds, dtype):
     with pytest.raises(ValueError, match="dtype: expected"):
         torch.nn.Sequential(ds).half()
     assert torch.equal(ds(y), wanted)
+
+
+NAMED = replace(datasets.archimedean_spiral(60), columns=("shoulder", "elbow"))
+
+
+@pytest.mark.parametrize("make", [lambda: ChebyshevDS(2, n_layers=5), lambda: ChebyshevDS(2, n_layers=5).slowed(2.0)])
+@pytest.mark.filterwarnings("ignore::latentds.FitWarning")
+def test_a_fit_keeps_the_names_of_the_coordinates(make, tmp_path):
+    ds = make()
+    assert ds.fit(NAMED).fit_report.columns == NAMED.columns
+    ds.save(tmp_path / "named")
+    assert latentds.load(tmp_path / "named").fit_report.columns == NAMED.columns
+    assert ds.fit(replace(NAMED, columns=())).fit_report.columns == ()
+
+
+def test_names_of_coordinates_change_no_number():
+    assert NAMED.fingerprint == replace(NAMED, columns=()).fingerprint
+
+
+def test_demonstrations_of_other_columns_are_not_fitted_together():
+    swapped = replace(NAMED, columns=("elbow", "shoulder"))
+    with pytest.raises(ValueError, match=r"^demonstration: expected the same columns in all, got"):
+        TubeDS(2).fit([NAMED, swapped])

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -137,3 +138,11 @@ for use in (lambda: latentds.compare({{'a': latentds.ChebyshevDS}}, latentds.dat
     else: raise SystemExit('expected an ImportError')
 """
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_pictures_name_the_coordinates_as_the_recording_does():
+    flat = replace(datasets.archimedean_spiral(40), columns=("shoulder", "cost $"))
+    axes = plotting.replications(flat, {}).axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("shoulder", r"cost \$")
+    assert plotting.joints(flat, {}).axes[0].get_ylabel() == "shoulder [rad]"
+    assert plotting.vector_field(ChebyshevDS(2), flat).axes[0].get_xlabel() == "shoulder"

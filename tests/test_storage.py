@@ -217,9 +217,9 @@ BAD = {
     "no format": (lambda p: written(p, format=...), "expected a format number in its metadata"),
     "newer": (
         lambda p: written(p, format=FORMAT + 1),
-        f"expected format 2, got {FORMAT + 1}: it needs a newer latentds",
+        f"expected format {FORMAT}, got {FORMAT + 1}: it needs a newer latentds",
     ),
-    "older": (lambda p: written(p, format=1), "expected format 2, got 1: it needs an older latentds"),
+    "older": (lambda p: written(p, format=1), f"expected format {FORMAT}, got 1: it needs an older latentds"),
     "no class": (lambda p: written(p, **{"class": ...}), "does not hold a system .* 'class'"),
     "a module's class": (lambda p: written(p, **{"class": "os.system"}), "expected a class among .*, got 'os.system'"),
     "unhashable class": (lambda p: written(p, **{"class": ["FDM"]}), "does not hold a system"),
