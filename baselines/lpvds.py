@@ -111,7 +111,8 @@ class LinearSystems(nn.Module):
     def matrices(self) -> Tensor:
         """A_k, (m, n, n)."""
         pulled = self.turning - self.turning.mT - self.damping @ self.damping.mT
-        return torch.linalg.solve(self.metric(), pulled) - RATE * torch.eye(len(self.root)).to(self.root)
+        found: Tensor = torch.linalg.solve(self.metric(), pulled) - RATE * torch.eye(len(self.root)).to(self.root)
+        return found
 
     def forward(self, u: Tensor) -> Tensor:
         """(..., n) -> (..., m, n)."""

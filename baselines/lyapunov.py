@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -102,7 +103,7 @@ class Bowl(nn.Module):
 
     def forward(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """(..., n) -> (...), (..., n)."""
-        first, second = self.direct
+        first, second = (cast(nn.Linear, layer) for layer in self.direct)
         inner, outer = softplus(self.passed[0]), softplus(self.passed[1])
         below_there = first.bias
         below = u @ first.weight.mT
