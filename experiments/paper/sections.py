@@ -283,8 +283,8 @@ def orbits(_: Study, found: Document) -> None:
         "The paper shows orbits of a DMP that cross each other, without its parameters. Ours: the stroke "
         f"{shown.name!r} of our own drawing, {dmp.n_basis} basis functions, α_z = {STIFFNESS:g}, β_z = α_z / 4, "
         f"α_x = {FADING:.3g}; {ORBITS} starts {RING:g} sizes around the demonstrated one. A DMP's force follows a "
-        "clock, so that one place has as many velocities as motions come by; orbits of an autonomous system, such as TubeDS, "
-        "cannot cross. Crossings at less than 10° are not counted, nor those within 0.05 sizes of the goal."
+        "clock, so that one place has as many velocities as motions come by; orbits of an autonomous system, such "
+        "as TubeDS, cannot cross. Crossings at less than 10° are not counted, nor those within 0.05 sizes of the goal."
     )
     found.show("dmp_orbits", drawn, f"{shown.name}: motions of a DMP and of TubeDS from the same {ORBITS} starts")
     found.find(verdicts.orbits(counts))
