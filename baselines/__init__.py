@@ -1,6 +1,14 @@
 """Methods to compare with."""
 
+from .clfdm import CLFDM
+from .cloning import BehaviourCloning
+from .contracting import NCDS
+from .dmp import DMP
 from .fdm import FDM
+from .lpvds import LPVDS
+from .lyapunov import NeuralLyapunov
+from .promp import ProMP
 from .sdsef import SDSEF
+from .seds import SEDS
 
-__all__ = ["FDM", "SDSEF"]
+__all__ = ["CLFDM", "DMP", "FDM", "LPVDS", "NCDS", "SDSEF", "SEDS", "BehaviourCloning", "NeuralLyapunov", "ProMP"]

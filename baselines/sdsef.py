@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ from latentds.demonstration import Demonstration, demonstrations_of, goal_apart
 from latentds.dynamics import Frame, LatentDynamics
 
 from .couplings import AffineCouplings, no_autocast
+from .networks import linear, seeded_generator
 from .training import Plan, Training, descend
 
 PLANS = {
@@ -76,7 +78,7 @@ class SDSEF(LatentDS):
         if recipe not in list(PLANS):
             raise ValueError(f"recipe: expected one of {sorted(PLANS)}, got {recipe!r}")
         self_seed = None if seed is None else whole_number(seed, "seed", at_least=0)
-        generator = _generator(self_seed)
+        generator = seeded_generator(self_seed)
         psi = AffineCouplings(dim, n_layers, n_features, generator=generator)
         super().__init__(dim, psi, NormalizedDescent(psi, generator=generator))
         self.n_layers, self.n_features = psi.n_layers, psi.n_features
@@ -93,11 +95,11 @@ class SDSEF(LatentDS):
         learner = SDSEF(
             self.dim, n_layers=psi.n_layers, n_features=psi.n_features, recipe=self.recipe, seed=self.seed
         ).to(self.attractor.device, torch.float32)
-        data = _Normalized.of(shown)
+        data = Normalized.of(shown)
         plan = PLANS[self.recipe]
         plan = plan if self.epochs is None else replace(plan, epochs=self.epochs)
         train = _train_tuned if self.recipe == "tuned" else _train_official
-        training = train(learner, data, plan, _generator(self.seed), progress)
+        training = train(learner, data, plan, seeded_generator(self.seed), progress)
         self.load_state_dict(learner.state_dict())
         self._place(data, shown)
         with torch.no_grad():
@@ -108,7 +110,7 @@ class SDSEF(LatentDS):
         return self
 
     @torch.no_grad()
-    def _place(self, data: _Normalized, shown: Sequence[Demonstration]) -> None:
+    def _place(self, data: Normalized, shown: Sequence[Demonstration]) -> None:
         """From normalised units to those of the demonstrations."""
         psi, dynamics = self.diffeomorphism, self.dynamics
         psi.center.copy_(data.center)
@@ -144,8 +146,8 @@ class NormalizedDescent(LatentDynamics):
         super().__init__()
         object.__setattr__(self, "psi", diffeomorphism)
         sizes = [diffeomorphism.dim, 100, 100, 1]
-        linear = [_linear(a, b, generator) for a, b in pairwise(sizes)]
-        self.network = nn.Sequential(linear[0], nn.LeakyReLU(), linear[1], nn.LeakyReLU(), linear[2])
+        maps = [linear(a, b, generator) for a, b in pairwise(sizes)]
+        self.network = nn.Sequential(maps[0], nn.LeakyReLU(), maps[1], nn.LeakyReLU(), maps[2])
         self.register_buffer("duration", torch.ones((), dtype=torch.float64))
         self.register_buffer("log_speed_range", torch.tensor([-1.0, 1.0], dtype=torch.float64))
 
@@ -213,7 +215,7 @@ class NormalizedDescent(LatentDynamics):
             super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
-class _Normalized(NamedTuple):
+class Normalized(NamedTuple):
     """Demonstrations in units of their box and their mean duration; their m goals are the last points."""
 
     points: Tensor
@@ -235,7 +237,7 @@ class _Normalized(NamedTuple):
     duration: float
 
     @classmethod
-    def of(cls, shown: Sequence[Demonstration]) -> _Normalized:
+    def of(cls, shown: Sequence[Demonstration]) -> Normalized:
         goal = torch.stack([d.goal for d in shown]).mean(0)
         for d in shown:
             goal_apart(d, goal)
@@ -270,7 +272,7 @@ class _Normalized(NamedTuple):
             duration,
         )
 
-    def straightened(self, share: float) -> _Normalized:
+    def straightened(self, share: float) -> Normalized:
         """The demonstrations on their way from their chords, share 0, to themselves, share 1."""
         return self._replace(
             points=torch.lerp(self.chord_points, self.points, share),
@@ -279,7 +281,7 @@ class _Normalized(NamedTuple):
 
 
 def _train_official(
-    learner: SDSEF, data: _Normalized, plan: Plan, generator: torch.Generator | None, progress: bool
+    learner: SDSEF, data: Normalized, plan: Plan, generator: torch.Generator | None, progress: bool
 ) -> Training:
     points, velocities, goal = (part.to(learner.attractor) for part in (data.points, data.velocities, data.goal))
     linearize, network = _linearize(learner), learner.dynamics.network
@@ -294,7 +296,18 @@ def _train_official(
 
 
 def _train_tuned(
-    learner: SDSEF, data: _Normalized, plan: Plan, generator: torch.Generator | None, progress: bool
+    learner: SDSEF, data: Normalized, plan: Plan, generator: torch.Generator | None, progress: bool
+) -> Training:
+    return descend_bending(partial(_tuned_loss, learner), learner, data, plan, generator, progress)
+
+
+def descend_bending(
+    loss_of: Callable[[Normalized], Callable[[Tensor], Tensor]],
+    learner: LatentDS,
+    data: Normalized,
+    plan: Plan,
+    generator: torch.Generator | None,
+    progress: bool,
 ) -> Training:
     """Continuation: a chord lies on one latent ray to begin with, and a curve that bends slowly is held there.
 
@@ -311,7 +324,7 @@ def _train_tuned(
         else:  # what the first bend leaves unlearned, no later stage has been seen to mend
             effort = replace(plan, epochs=max(1, 4 * short if stage == 1 else short), warm_up=0.3)
         training = descend(
-            _tuned_loss(learner, data.straightened(stage / stages)),
+            loss_of(data.straightened(stage / stages)),
             list(learner.parameters()),
             len(data.points) - len(data.starts),
             effort,
@@ -323,17 +336,31 @@ def _train_tuned(
     return Training(tuple(history), tuple(notes))
 
 
-def _tuned_loss(learner: SDSEF, data: _Normalized) -> Callable[[Tensor], Tensor]:
+def _tuned_loss(learner: SDSEF, data: Normalized) -> Callable[[Tensor], Tensor]:
+    def descent(u: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+        return _unit(z), -learner.dynamics.network(u).exp()
+
+    return ray_loss(learner.diffeomorphism, descent, data)
+
+
+def ray_loss(
+    psi: AffineCouplings, field: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], data: Normalized
+) -> Callable[[Tensor], Tensor]:
     """2 mean(√(1 + ‖v̂-v‖²/‖v‖²) - 1) + mean(√(1 + ‖J_φ⁻¹ d / 0.05‖²) - 1) + mean ‖z/‖z‖ - e‖².
 
     e is the direction of z at the demonstrated start and d = z - max(0, z·e) e the way off the ray along it. The goals
     themselves have no direction and are left out.
+
+    Args:
+        psi: φ⁻¹, of which z = φ(u) - φ(goal).
+        field: u and z, (b, n) each -> a latent velocity, (b, n), and a factor, (b, 1), which v̂ = J_φ⁻¹ (…) has, too.
+        data: the demonstrations.
     """
     points, velocities, starts, goal = (
-        part.to(learner.attractor) for part in (data.points, data.velocities, data.starts, data.goal)
+        part.to(psi.center) for part in (data.points, data.velocities, data.starts, data.goal)
     )
     owner = data.owner.to(points.device)
-    linearize, network = _linearize(learner), learner.dynamics.network
+    linearize = psi.compiled_linearize() if points.device.type == "cpu" else psi.linearize
     squared_speeds = velocities.square().sum(-1)
     squared_speeds = squared_speeds + REST**2 * squared_speeds.mean()
     anchors = torch.cat([starts, goal.unsqueeze(0)])
@@ -342,14 +369,14 @@ def _tuned_loss(learner: SDSEF, data: _Normalized) -> Callable[[Tensor], Tensor]
         u, v, n = points[batch], velocities[batch], len(batch)
         x, push = linearize(torch.cat([u, anchors]))
         z = x - x[-1]
-        heading = _unit(z)
-        ray = heading[n:-1][owner[batch]]
+        ray = _unit(z[n:-1])[owner[batch]]
         aside = z[:n] - (z[:n] * ray).sum(-1, keepdim=True).clamp(min=0) * ray
-        aside = torch.cat([aside, torch.zeros_like(anchors)])
-        flow, away = push(torch.stack([heading, aside]))[:, :n]
-        error = (-network(u).exp() * flow - v).square().sum(-1) / squared_speeds[batch]
+        latent, factor = field(u, z[:n])
+        rest = torch.zeros_like(anchors)
+        flow, away = push(torch.stack([torch.cat([latent, rest]), torch.cat([aside, rest])]))[:, :n]
+        error = (factor * flow - v).square().sum(-1) / squared_speeds[batch]
         bend = (away / BEND).square().sum(-1)
-        turn = (heading[:n] - ray).square().sum(-1)
+        turn = (_unit(z[:n]) - ray).square().sum(-1)
         return torch.mean(2 * ((1 + error).sqrt() - 1) + (1 + bend).sqrt() - 1 + turn)
 
     return loss
@@ -392,19 +419,3 @@ def _cumulative(f: Tensor) -> Tensor:
 def _hermite(s: Tensor, left: Tensor, right: Tensor) -> Tensor:
     """From 0 to 1 over s in [0, 1], with slopes ``left`` at 0 and ``right`` at 1."""
     return s * (left + s * (3 - 2 * left - right + s * (left + right - 2)))
-
-
-def _generator(seed: int | None) -> torch.Generator | None:
-    return None if seed is None else torch.Generator().manual_seed(seed)
-
-
-def _linear(n_in: int, n_out: int, generator: torch.Generator | None) -> nn.Linear:
-    """torch's own initial weights, but from a generator and without touching the global one."""
-    device = torch.get_default_device()  # which skip_init does not ask
-    layer: nn.Linear = nn.utils.skip_init(  # type: ignore[no-untyped-call]
-        nn.Linear, n_in, n_out, dtype=torch.float64, device=device
-    )
-    bound = n_in**-0.5
-    for part in (layer.weight, layer.bias):
-        nn.init.uniform_(part, -bound, bound, generator=generator)
-    return layer

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize
 from torch import Tensor, nn
 
 MAX_RECOVERIES = 25
@@ -136,6 +139,49 @@ def descend(
     if recoveries:
         notes.append(f"recovered from {min(recoveries, MAX_RECOVERIES)} divergences")
     return Training(tuple(history), tuple(notes))
+
+
+def descend_smoothly(
+    loss: Callable[[], Tensor], parameters: Mapping[nn.Parameter, float], iterations: int
+) -> tuple[float, ...]:
+    """Minimise a smooth loss of all samples at once by SciPy's L-BFGS; the parameters end where it ends.
+
+    Args:
+        loss: () -> (), of the parameters as they are; float64.
+        parameters: what to move, and by how much at a time, > 0: where steps of such lengths change the loss about
+            equally, L-BFGS does not get stuck.
+        iterations: at most, >= 1.
+
+    Returns:
+        The loss after each iteration.
+    """
+    history: list[float] = []
+    moved = list(parameters)
+    sizes = [p.numel() for p in moved]
+    steps = torch.cat([torch.full((p.numel(),), step, dtype=p.dtype) for p, step in parameters.items()])
+
+    def assign(flat: NDArray[np.float64]) -> None:
+        values = torch.split(torch.from_numpy(flat) * steps, sizes)
+        _copy(moved, [value.view_as(p) for value, p in zip(values, moved, strict=True)])
+
+    def evaluate(flat: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        assign(flat)
+        with torch.enable_grad():
+            value = loss()
+            slopes = torch.autograd.grad(value, moved)
+        return float(value.detach()), (torch.cat([slope.flatten() for slope in slopes]) * steps).numpy()
+
+    begin = (torch.cat([p.detach().flatten() for p in moved]) / steps).numpy()
+    found = minimize(
+        evaluate,
+        begin,
+        jac=True,
+        method="L-BFGS-B",
+        callback=lambda intermediate_result: history.append(float(intermediate_result.fun)),
+        options={"maxiter": iterations, "maxfun": 2 * iterations, "maxcor": 20, "ftol": 1e-8, "gtol": 1e-8},
+    )
+    assign(found.x)
+    return tuple(history)
 
 
 def _adam(parameters: Sequence[nn.Parameter], plan: Plan) -> torch.optim.Adam:

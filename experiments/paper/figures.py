@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 from numpy.typing import NDArray
+from torch import Tensor
 
 from latentds import ChebyshevDS, Demonstration, LatentDS, StableDS
 from latentds.fitting.embedding import chebyshev_columns
@@ -190,6 +192,51 @@ def planes(motions: Sequence[Demonstration], fitted: Mapping[str, Mapping[str, S
             moved.set_title(f"{shown.name}: {method}, rollouts", fontsize=10)
             field.set_title(f"{shown.name}: {method}, field", fontsize=10)
     return figure
+
+
+def orbits(shown: Demonstration, fitted: Mapping[str, StableDS], begins: Tensor) -> tuple[Figure, dict[str, int]]:
+    """Planar motions from starts (B, 2), a picture for each system, crossings marked, and how many there are.
+
+    Motions last thrice the duration; what lies within a twentieth of the size of the goal is left out.
+    """
+    points, counts = shown.positions.numpy(), {}
+    figure = Figure(figsize=(5.2 * len(fitted), 5), dpi=DPI, layout="constrained")
+    for axes, (method, ds) in zip(figure.subplots(1, len(fitted), squeeze=False)[0], fitted.items(), strict=True):
+        with torch.no_grad():
+            paths = ds.rollout(begins, torch.linspace(0, 3 * shown.duration, 900)).numpy()
+        far = np.linalg.norm(paths - points[-1], axis=-1) > 0.05 * shown.size
+        met = crossings(np.where(far[..., None], paths, np.nan))
+        counts[method] = len(met)
+        for path in paths:
+            axes.plot(*path.T, color=color_of(method), lw=1, alpha=0.7)
+        axes.plot(*paths[:, 0].T, "o", color=color_of(method), ms=3)
+        axes.plot(*points.T, color=SHOWN, lw=1.6, ls="--", label="demonstration")
+        axes.plot(*met.T, "x", color=SHOWN, ms=5, label="crossing")
+        axes.plot(*points[-1], **GOAL)
+        axes.set_title(f"{shown.name}: {method}, {len(met)} crossings", fontsize=10)
+        axes.set_aspect("equal")
+        axes.tick_params(labelsize=7)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+    return figure, counts
+
+
+def crossings(paths: Array, angle: float = 10.0) -> Array:
+    """Where planar paths (B, T, 2) cross each other at more than so many degrees: (C, 2). Steps with NaN cross none."""
+    found = [np.empty((0, 2))]
+    for one, other in combinations(paths, 2):
+        p, q = one[:-1, None], other[None, :-1]
+        u, v = np.diff(one, axis=0)[:, None], np.diff(other, axis=0)[None]
+        turn, gap = _cross(u, v), q - p
+        with np.errstate(divide="ignore", invalid="ignore"):
+            s, t = _cross(gap, v) / turn, _cross(gap, u) / turn
+            apart = np.degrees(np.arctan2(np.abs(turn), (u * v).sum(-1))) > angle
+        i, j = np.nonzero((s >= 0) & (s < 1) & (t >= 0) & (t < 1) & apart)
+        found.append(one[i] + s[i, j, None] * u[i, 0])
+    return np.concatenate(found)
+
+
+def _cross(u: Array, v: Array) -> Array:
+    return np.asarray(u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0])
 
 
 def linearity(frame: pd.DataFrame, slopes: Mapping[int, float]) -> Figure:

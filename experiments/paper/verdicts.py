@@ -195,6 +195,11 @@ def sensitivity(lines: pd.DataFrame) -> Finding:
     )
 
 
+def orbits(counts: Mapping[str, int]) -> Finding:
+    told = ", ".join(f"{method} {count}" for method, count in counts.items())
+    return Finding("DMP's forward orbits", "cross", f"crossings: {told}", _held(counts["DMP"] and not counts["TubeDS"]))
+
+
 def left_out(missing: Mapping[str, str]) -> list[Finding]:
     return [Finding(what, "figure", "—", f"not reproducible: {why}") for what, why in missing.items()]
 

@@ -9,7 +9,7 @@ import torch
 import typer
 
 from experiments.methods import GREEDY, RIVALS, greedy
-from experiments.paper import latent_space, tuning, verdicts
+from experiments.paper import figures, latent_space, tuning, verdicts
 from experiments.paper.__main__ import main, reproduce
 from experiments.paper.held_out import HeldOut
 from experiments.paper.plan import Plan
@@ -112,6 +112,14 @@ def test_variants_differ_from_the_method_in_one_thing(method):
 )
 def test_figures_within_a_factor_are_reproduced(ratios, verdict):
     assert verdicts.similar(*ratios) == verdict
+
+
+def test_crossings_are_counted_where_they_are():
+    s = np.linspace(-1, 1, 51)
+    diagonals = np.stack([np.stack([s, s + 0.013], axis=1), np.stack([s, 0.2 - s], axis=1)])
+    np.testing.assert_allclose(figures.crossings(diagonals), [[0.0935, 0.1065]], atol=1e-12)
+    parallel = np.stack([np.stack([s, 0 * s], axis=1), np.stack([s, 0.01 * s], axis=1)])
+    assert len(figures.crossings(parallel)) == 0
 
 
 def test_the_summary_counts_what_the_lines_say():

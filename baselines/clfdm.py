@@ -1,0 +1,189 @@
+"""CLF-DM: any regression, corrected to descend a learned Lyapunov function (Khansari-Zadeh and Billard 2014)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from latentds.arguments import whole_number
+from latentds.base import FitReport, StableDS
+from latentds.demonstration import Demonstration, demonstrations_of
+
+from .mixture import MixtureRegression, drawn_seed, fit_regression, nearby
+from .pooling import Pool
+from .training import descend_smoothly
+
+RATE = 1.0
+"""α: V falls at least by α V a duration, so that whatever the regression says a motion is within a hundredth of its way
+after ten."""
+REACH = 0.02
+"""Sizes around the goal within which the regression, which is not 0 there, is led to 0."""
+HASTE = 2.0
+"""Times the largest demonstrated speed that f approaches where its linear maps, far from where they were learned, would
+be faster; what was shown it changes by less than a thousandth."""
+FLATTEST = 1e-2
+"""Least eigenvalue of the quadratic part of V, whose others are about 1."""
+REWARD = 1e-4
+"""Weight of descending steeply beside that of not rising, as in the authors' code."""
+
+
+class CLFDM(StableDS):
+    """Control Lyapunov function-based dynamic movements: ẏ = f(y) + u(y), u as small as makes V fall (2014).
+
+    V is a weighted sum of asymmetric quadratic functions, learned from the directions of the demonstrated velocities
+    alone; f is Gaussian mixture regression of the velocities; and u = -∇V max(0, ∇V·f + ρ)/‖∇V‖², the least that gives
+    V̇ <= -ρ. Where the demonstrations descend V, f is left as it is. Four things are our own: all matrices are positive
+    by parametrisation, so that L-BFGS learns V without constraints; the margin is ρ = α V, which grows without bound
+    and makes V fall exponentially; and f fades to 0 at the goal within ``REACH`` sizes of it, without which the field
+    would jump there, and grows no faster than ``HASTE`` demonstrated speeds.
+
+    Learns from one demonstration or from several, pooled; their goals' mean is the attractor. ``fit_report.mse`` is the
+    mean over all N n entries of the squared velocity error, (units / second)²; ``n_layers`` is the mixture's K; the
+    notes tell where demonstrations do not descend V.
+
+    Args:
+        dim: n >= 1.
+        n_components: K >= 1 of the regression; None for as many of 1 to 12 as the Bayesian information criterion
+            chooses.
+        n_asymmetric: L >= 0 asymmetric functions in V; with none it is a quadratic form.
+        iterations: of L-BFGS at most, >= 1.
+        seed: of the mixture's k-means; None draws it from torch's generator.
+
+    Attributes:
+        size, duration: () buffers: the units of length and of time in which V and f are written.
+        pace: () buffer, the largest demonstrated speed in these units.
+    """
+
+    size: Tensor
+    duration: Tensor
+    pace: Tensor
+
+    def __init__(
+        self,
+        dim: int,
+        *,
+        n_components: int | None = None,
+        n_asymmetric: int = 3,
+        iterations: int = 300,
+        seed: int | None = None,
+    ) -> None:
+        super().__init__(dim)
+        self.n_components = None if n_components is None else whole_number(n_components, "n_components", at_least=1)
+        self.n_asymmetric = whole_number(n_asymmetric, "n_asymmetric", at_least=0)
+        self.iterations = whole_number(iterations, "iterations", at_least=1)
+        self.seed = None if seed is None else whole_number(seed, "seed", at_least=0)
+        self.register_buffer("size", torch.ones((), dtype=torch.float64))
+        self.register_buffer("duration", torch.ones((), dtype=torch.float64))
+        self.register_buffer("pace", torch.ones((), dtype=torch.float64))
+        self.energy = AsymmetricQuadratics(self.dim, self.n_asymmetric)
+        self.regression = MixtureRegression(self.dim)
+
+    def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> CLFDM:
+        shown = demonstrations_of(demonstration, self.dim)
+        began = time.perf_counter()
+        pool = Pool.of(shown)
+        regression = fit_regression(pool, self.n_components, drawn_seed(self.seed))
+        energy = AsymmetricQuadratics(self.dim, self.n_asymmetric)
+        speeds, distances = (torch.linalg.vector_norm(part, dim=-1) for part in (pool.velocities, pool.points))
+        moving = (speeds > 1e-3 * speeds.max()) & (distances > REACH)
+        points, headings = pool.points[moving], pool.velocities[moving] / speeds[moving, None]
+        energy.begin(points)
+
+        def rises() -> Tensor:
+            slopes = energy.gradient(points)
+            cosines: Tensor = (slopes * headings).sum(-1) / torch.linalg.vector_norm(slopes, dim=-1)
+            return cosines
+
+        def loss() -> Tensor:
+            rise = rises()
+            return torch.where(rise > 0, rise.square(), -REWARD * rise.square()).mean()
+
+        history = descend_smoothly(loss, dict.fromkeys(energy.parameters(), 1.0), self.iterations)
+        with torch.no_grad():
+            share = float((rises() > 0).double().mean())
+            self.energy.load_state_dict(energy.state_dict())
+            self.regression.load_state_dict(regression.state_dict())
+            self.attractor.copy_(pool.goal)
+            for name in ("size", "duration"):
+                self.get_buffer(name).copy_(getattr(pool, name))
+            self.pace.copy_(speeds.max())
+            missed = self._velocity(pool.points.to(self.attractor)) - pool.velocities.to(self.attractor)
+            mse = float(missed.square().mean() * (pool.size / pool.duration) ** 2)
+        notes = (f"V rises along {share:.1%} of the demonstrated samples, where it bends the motion",) if share else ()
+        seconds, origins = time.perf_counter() - began, tuple(d.fingerprint for d in shown)
+        self.fit_report = FitReport(mse, regression.mixture.n_components, seconds, history, notes, origins)
+        return self
+
+    def forward(self, y: Tensor) -> Tensor:
+        points, wanted = self._points(y)
+        velocity = self._velocity((points - self.attractor) / self.size)
+        return (velocity * (self.size / self.duration)).to(wanted)
+
+    def lyapunov(self, y: Tensor) -> Tensor:
+        points, wanted = self._points(y)
+        energy: Tensor = self.energy((points - self.attractor) / self.size)
+        return energy.to(wanted)
+
+    def _velocity(self, z: Tensor) -> Tensor:
+        """In sizes per duration at z, in sizes from the goal: (..., n) -> (..., n)."""
+        fading = -torch.expm1(-z.square().sum(-1, keepdim=True) / (2 * REACH**2))
+        wish = fading * self.regression(z, nearby(z))
+        speed = torch.linalg.vector_norm(wish, dim=-1, keepdim=True)
+        wish = wish / (1 + (speed / (HASTE * self.pace)) ** 8) ** 0.125
+        slope = self.energy.gradient(z)
+        excess = (slope * wish).sum(-1) + RATE * self.energy(z)
+        steep = slope.square().sum(-1).clamp(min=torch.finfo(z.dtype).tiny)
+        velocity: Tensor = wish - (excess.clamp(min=0) / steep).unsqueeze(-1) * slope
+        return velocity
+
+
+class AsymmetricQuadratics(nn.Module):
+    """V(z) = zᵀ P₀ z + Σ_l max(0, zᵀ P_l (z - μ_l))² with P₀ > 0 and P_l >= 0, by P = R Rᵀ.
+
+    z·∇V > 0 everywhere but at 0, whatever the parameters are: V has no other stationary point, and grows without bound.
+
+    Attributes:
+        root: (n, n), of P₀ - ``FLATTEST`` I.
+        roots: (L, n, n), R_l.
+        centers: (L, n), μ_l.
+    """
+
+    def __init__(self, dim: int, n_asymmetric: int) -> None:
+        super().__init__()
+        eye = torch.eye(dim, dtype=torch.float64)
+        self.root = nn.Parameter(eye.clone())
+        self.roots = nn.Parameter(eye.expand(n_asymmetric, -1, -1).clone())
+        self.centers = nn.Parameter(torch.zeros(n_asymmetric, dim, dtype=torch.float64))
+
+    @torch.no_grad()
+    def begin(self, points: Tensor) -> None:
+        """Spread the centers along points (N, n)."""
+        places = torch.linspace(0, len(points) - 1, len(self.centers) + 2)[1:-1].round().long()
+        self.centers.copy_(points[places])
+
+    def forward(self, z: Tensor) -> Tensor:
+        """(..., n) -> (...)."""
+        pulled, quadratic = self._terms(z)
+        energy: Tensor = (z * pulled).sum(-1) + quadratic[0].clamp(min=0).square().sum(-1)
+        return energy
+
+    def gradient(self, z: Tensor) -> Tensor:
+        """∇V, (..., n) -> (..., n)."""
+        pulled, (values, slopes) = self._terms(z)
+        slope: Tensor = 2 * pulled + (2 * values.clamp(min=0).unsqueeze(-1) * slopes).sum(-2)
+        return slope
+
+    def _terms(self, z: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """P₀ z, and zᵀ P_l (z - μ_l), (..., L), with its gradient P_l (2 z - μ_l), (..., L, n)."""
+        pulled = _times(self.root @ self.root.mT, z) + FLATTEST * z
+        here, forms = z.unsqueeze(-2), self.roots @ self.roots.mT
+        values = (here * _times(forms, here - self.centers)).sum(-1)
+        return pulled, (values, _times(forms, 2 * here - self.centers))
+
+
+def _times(matrices: Tensor, vectors: Tensor) -> Tensor:
+    """Matrices (..., n, n) by vectors (..., n), summed alike in every batch."""
+    return (matrices * vectors.unsqueeze(-2)).sum(-1)

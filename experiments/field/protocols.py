@@ -1,0 +1,52 @@
+"""The field's own ways to show handwriting and to judge what was learned, each as a cell of a comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from latentds import Demonstration, StableDS
+from latentds.benchmark import Cell, Factory
+from latentds.metrics import velocity_cosine
+
+TRAINING = 4
+"""Demonstrations that protocol C trains on; it is judged by the others."""
+
+
+def thinned(shown: Demonstration, stride: int) -> Demonstration:
+    """Every so manyth sample."""
+    return replace(shown, positions=shown.positions[::stride], dt=shown.dt * stride)
+
+
+def protocol_c(label: str, factory: Factory, shape: Sequence[Demonstration], seed: int = 0) -> Cell:
+    """Held-out velocities (Figueroa and Billard 2018): trained on four, judged by the others, every second sample.
+
+    Rows tell, beside the usual, ``train_rmse``, ``train_e``, ``test_rmse`` and ``test_e``: see :func:`velocity_errors`.
+    """
+    some = [thinned(shown, 2) for shown in shape]
+    return Cell(label, factory, some[:TRAINING], seed, judges=some[TRAINING:], measure=held_out_velocities)
+
+
+def held_out_velocities(ds: StableDS, cell: Cell) -> dict[str, float]:
+    """The velocity errors at the samples shown and at the judges'."""
+    return {
+        f"{part}_{what}": value
+        for part, some in (("train", cell.shown), ("test", cell.judges))
+        for what, value in velocity_errors(ds, some).items()
+    }
+
+
+def velocity_errors(ds: StableDS, some: Sequence[Demonstration]) -> dict[str, float]:
+    """How far off the velocities are at all samples of some demonstrations together, as ds-opt counts.
+
+    ``rmse``: mean over samples of the root of the mean over coordinates of the squared error, units per second; ``e``:
+    mean of 1 - cos of the angle, samples at rest left out.
+    """
+    positions, shown = torch.cat([d.positions for d in some]), torch.cat([d.velocities for d in some])
+    with torch.no_grad():
+        missed = (ds(positions) - shown).numpy()
+        cosine = velocity_cosine(ds(positions), shown)
+    return {"rmse": float(np.sqrt(np.square(missed).mean(axis=1)).mean()), "e": 1 - cosine}

@@ -1,0 +1,95 @@
+"""LPV-DS: stable whatever its parameters are, and its programs find what is known."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+
+import latentds
+from baselines.lpvds import LPVDS, RATE, LinearSystems
+from latentds import Demonstration, datasets
+from latentds.testing import parametrize_stable_ds, wavy_motion
+
+pytest.importorskip("cvxpy")
+
+
+def small(dim, **settings):
+    return LPVDS(dim, **{"n_components": 4, "seed": 0, **settings})
+
+
+@parametrize_stable_ds({"LPVDS": small}, dims=[2])
+def test_contract(check):
+    check()
+
+
+@pytest.mark.slow
+@parametrize_stable_ds({"LPVDS": small}, dims=[1, 7])
+def test_contract_in_other_dimensions(check):
+    check()
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return small(3).fit(wavy_motion(3))
+
+
+def test_the_inequality_holds_whatever_the_parameters_are(draw):
+    systems = LinearSystems(4)
+    systems.assign(np.eye(4), np.stack([-np.eye(4)] * 3))
+    for parameter in systems.parameters():
+        torch.nn.init.normal_(parameter, generator=draw)
+    pulled = systems.metric() @ systems.matrices() + RATE * systems.metric()
+    assert float(torch.linalg.eigvalsh(pulled + pulled.mT).detach().max()) < 1e-9
+    assert float(torch.linalg.eigvalsh(systems.metric()).detach().min()) > 0
+
+
+def test_assigned_systems_come_back():
+    metric = np.array([[1.0, 0.2], [0.2, 0.5]])
+    matrices = np.stack([[[-1.0, 2.0], [-3.0, -1.0]], [[-0.5, 0.0], [0.1, -0.7]]])
+    systems = LinearSystems(2)
+    systems.assign(metric, matrices)
+    torch.testing.assert_close(systems.metric().detach(), torch.from_numpy(metric))
+    torch.testing.assert_close(systems.matrices().detach(), torch.from_numpy(matrices))
+
+
+def test_finds_the_linear_system_that_moved():
+    """One that spirals in, whose motion is known: exp(At) y₀."""
+    matrix = torch.tensor([[-1.0, 3.0], [-3.0, -1.0]], dtype=torch.float64)
+    start = torch.tensor([1.0, 0.5], dtype=torch.float64)
+    path = torch.stack([torch.linalg.matrix_exp(t * matrix) @ start for t in torch.linspace(0, 8, 801)])
+    ds = small(2, n_components=1).fit(Demonstration(path, 0.01))
+    with torch.no_grad():
+        slope = torch.func.jacrev(ds)(ds.attractor + 0.1)
+    torch.testing.assert_close(slope, matrix, rtol=0.02, atol=0.02)
+
+
+def test_v_falls_as_fast_as_promised(fitted, draw):
+    y = fitted.attractor + 3 * torch.randn(300, 3, generator=draw, dtype=torch.float64)
+    energy, slope = torch.func.jvp(fitted.lyapunov, (y,), (fitted(y).detach(),))
+    assert bool((slope <= -2 * RATE / fitted.duration * energy * (1 - 1e-9)).all())
+
+
+def test_learns_from_several_and_is_kept(tmp_path):
+    one, other = wavy_motion(2), wavy_motion(2, seed=1)
+    ds, y = small(2).fit([one, other]), one.positions
+    torch.testing.assert_close(ds.attractor, (one.goal + other.goal) / 2)
+    with torch.no_grad():
+        assert torch.equal(small(2).fit([one, other])(y), ds(y))
+        ds.save(tmp_path / "ds")
+        assert torch.equal(latentds.load(tmp_path / "ds", classes=[LPVDS])(y), ds(y))
+        assert torch.equal(copy.deepcopy(ds)(y), ds(y))
+
+
+@pytest.mark.slow
+def test_follows_a_winding_spiral():
+    report = LPVDS(3, seed=0).fit(datasets.unstable_spiral(7, 500)).fit_report
+    assert report.fidelity.miss < 0.08
+
+
+@pytest.mark.parametrize(("argument", "value"), [("n_components", 0), ("seed", -1)])
+def test_bad_arguments_are_named(argument, value):
+    with pytest.raises(ValueError, match=f"^{argument}: expected"):
+        small(2, **{argument: value})
