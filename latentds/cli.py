@@ -278,9 +278,7 @@ def demo(
     if out.exists():
         raise ValueError(f"out: {out} is there already; say where: --out FILE")
     motion, names = joint_motion(seed), [f"joint_{i}" for i in range(1, 8)]
-    write_motion(
-        target(out, (), ""), motion.times.numpy(), motion.positions.numpy(), [f"joint_{i}" for i in range(1, 8)]
-    )
+    write_motion(target(out, (), ""), motion.times.numpy(), motion.positions.numpy(), names)
     tell(f"{out}: {motion.duration:.1f} s of a made-up reach, seven joints in rad. Now try:\n")
     tell(f"  latentds fit {out}\n  latentds report {out}")
 
