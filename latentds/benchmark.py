@@ -99,7 +99,7 @@ def compare(
     _only_once("demonstrations", [cell.demonstration for cell in cells[:: len(methods) * len(seeds)]])
     outcomes = run(cells, Protocol(n_starts, radius, n_points), n_jobs=n_jobs, progress=progress, store=store)
     _try_out(cells)
-    rows = []
+    rows: list[dict[str, Any]] = []
     for outcome in outcomes:
         rows += outcome.rows
         if paths is not None:

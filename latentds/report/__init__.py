@@ -8,7 +8,7 @@ import json
 import math
 import os
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from importlib import metadata
@@ -22,17 +22,10 @@ from scipy import stats
 from .. import plotting
 from ..arguments import real_array
 from ..benchmark import Cell
-from ..cell import COLUMNS, several
+from ..cell import COLUMNS, joint_name, several
 from ..certificate import certify
 from ..demonstration import Demonstration
 from ..files import atomic_write
-
-try:
-    from jinja2 import Environment, StrictUndefined
-    from markupsafe import Markup
-    from plotly.offline import get_plotlyjs
-except ImportError as error:
-    raise ImportError(f"reports need {error.name}: pip install 'latentds[cli]'") from error
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -79,23 +72,18 @@ def write(
         ValueError: if an argument is none of this, or the demonstrations do not fit the rows.
         ImportError: without plotly and jinja2: ``pip install 'latentds[cli]'``.
     """
-    if missing := {*COLUMNS} - set(rows):
-        raise ValueError(f"rows: expected the columns of compare, got none named {sorted(missing)}")
-    if rows.empty:
-        raise ValueError("rows: expected at least one")
     motions = _motions(rows, demonstrations)
     colors = _colors(list(rows["method"].unique()))
-    ranking = _ranking(rows, motions, list(colors))
     data = {
         "labels": list(colors),
         "colors": list(colors.values()),
         "shown": plotting.SHOWN,
-        "motions": [_drawn(motion, rows, paths or {}, list(colors), motions) for motion in motions],
+        "motions": [_drawn(motion, rows, paths or {}, list(colors), len(motions)) for motion in motions],
     }
     text = _page(
         title=motions[0].name if len(motions) == 1 else f"{len(motions)} motions",
-        verdict=_verdict(ranking, motions, rows),
-        ranking=ranking,
+        verdict=verdict(rows, demonstrations),
+        ranking=ranking(rows, demonstrations),
         by_motion=_by_motion(rows, motions, list(colors)) if len(motions) > 1 else [],
         certificates=_certificates(rows),
         settings=_flat({**(settings or {}), **environment()}),
@@ -156,16 +144,20 @@ class _Motion:
 
 
 def _motions(rows: pd.DataFrame, demonstrations: Any) -> list[_Motion]:
+    if missing := {*COLUMNS} - set(rows):
+        raise ValueError(f"rows: expected the columns of compare, got none named {sorted(missing)}")
+    if rows.empty:
+        raise ValueError("rows: expected at least one")
     items = [demonstrations] if isinstance(demonstrations, Demonstration) else list(demonstrations)
-    found = {Cell("", lambda dim: None, item).demonstration: several(item, "demonstrations") for item in items}  # type: ignore[arg-type,return-value]
+    found = {joint_name(some): some for some in (several(item, "demonstrations") for item in items)}
     names = list(rows["demonstration"].unique())
     if absent := [name for name in names if name not in found]:
         raise ValueError(f"demonstrations: expected those of the rows, got none named {absent[0]!r}")
     motions = []
     for name in names:
         count = int(rows.loc[rows["demonstration"] == name, "start"].max()) + 1
-        if count % len(found[name]):
-            raise ValueError(f"demonstrations: expected the judges of {name!r}, got {len(found[name])} for {count} starts")
+        if count % (judges := len(found[name])):
+            raise ValueError(f"demonstrations: expected the judges of {name!r}, got {judges} for {count} starts")
         if "judge" in rows and {*rows.loc[rows["demonstration"] == name, "judge"]} != {d.name for d in found[name]}:
             raise ValueError(f"rows: expected motions judged by those that were shown, got {name!r} judged by others")
         motions.append(_Motion(name, found[name], count // len(found[name])))
@@ -196,15 +188,28 @@ def _level(scores: Array) -> float:
     return float(scores.mean()) if len(scores) and np.isfinite(scores).all() else math.inf
 
 
+def _spread(scores: Array) -> float:
+    return float(scores.std(ddof=1)) if len(scores) > 1 else 0.0
+
+
 def _judged(own: Array, others: Array) -> Array:
     """What methods are ranked by: starts nobody showed, if there are some."""
     return others if len(others) else own
 
 
-def _ranking(rows: pd.DataFrame, motions: Sequence[_Motion], labels: Sequence[str]) -> list[dict[str, Any]]:
-    """A line for each method, the best first; distances in sizes of the motion, means over motions."""
+def ranking(rows: pd.DataFrame, demonstrations: Any) -> list[dict[str, Any]]:
+    """A line for each method, the best first; arguments as for :func:`write`.
+
+    Returns:
+        Mappings of "method"; "level", "spread" and "worst": mean, standard deviation and largest exact DTW over points,
+        in sizes of the motion, from the starts around the demonstrated one (from that if there are no others), means
+        over motions; "own" from the demonstrated one; "end", how far motions end from the demonstrated end, in sizes;
+        "arrives" and "follows", (how many, of how many) rows converged and fits follow; "seconds" of a fit; "failed"
+        rows; "motions".
+    """
+    motions = _motions(rows, demonstrations)
     lines = []
-    for label in labels:
+    for label in rows["method"].unique():
         of = rows[rows["method"] == label]
         known = [motion for motion in motions if (of["demonstration"] == motion.name).any()]
         pairs = [_distances(rows, motion, label) for motion in known]
@@ -216,7 +221,7 @@ def _ranking(rows: pd.DataFrame, motions: Sequence[_Motion], labels: Sequence[st
                 "method": label,
                 "level": float(np.mean([_level(scores) for scores in judged])),
                 "own": float(np.mean([_level(own) for own, _ in pairs])),
-                "spread": float(np.mean([scores.std(ddof=1) if len(scores) > 1 else 0.0 for scores in judged])),
+                "spread": float(np.mean([_spread(scores) for scores in judged])),
                 "worst": float(np.max([scores.max() for scores in judged])),
                 "end": float((of["endpoint_error"] / sizes).mean(skipna=False)),
                 "arrives": (int(of["converged"].sum()), len(of)),
@@ -236,8 +241,7 @@ def _by_motion(rows: pd.DataFrame, motions: Sequence[_Motion], labels: Sequence[
         levels = {label: _level(found) for label, found in scores.items()}
         best = min(levels.values())
         cells = [
-            {"level": levels[label], "spread": found.std(ddof=1) if len(found) > 1 else 0.0, "best": levels[label] == best}
-            for label, found in scores.items()
+            {"level": level, "spread": _spread(scores[label]), "best": level == best} for label, level in levels.items()
         ]
         lines.append({"name": motion.name, "cells": cells})
     return lines
@@ -246,15 +250,20 @@ def _by_motion(rows: pd.DataFrame, motions: Sequence[_Motion], labels: Sequence[
 # What it says --------------------------------------------------------------------------------------------------------
 
 
-def _percent(share: float) -> str:
+def percent(share: float) -> str:
+    """Two figures; a dash for none."""
     if not math.isfinite(share):
         return "—"
     return f"{100 * share:.2g} %" if 100 * share < 99.5 else f"{100 * share:.0f} %"
 
 
-def _verdict(ranking: Sequence[Mapping[str, Any]], motions: Sequence[_Motion], rows: pd.DataFrame) -> list[str]:
-    """Sentences: which method follows best, by how much, whether that may be chance, and what is off."""
-    best, *others = ranking
+def verdict(rows: pd.DataFrame, demonstrations: Any) -> list[str]:
+    """Sentences: which method follows best, by how much, whether that may be chance, and what is off.
+
+    Arguments as for :func:`write`.
+    """
+    motions, lines = _motions(rows, demonstrations), ranking(rows, demonstrations)
+    best, *others = lines
     what = motions[0].name if len(motions) == 1 else f"{len(motions)} motions"
     count = max(motion.share for motion in motions) - 1
     where = f"from {count} starts around the demonstrated one" if count else "from the demonstrated start"
@@ -264,28 +273,31 @@ def _verdict(ranking: Sequence[Mapping[str, Any]], motions: Sequence[_Motion], r
         follows = best["follows"][0] == best["follows"][1]
         verb = "follows" if follows else "does not follow as it should"
         said = [
-            f"{best['method']} {verb}: {what}, at a mean distance of {_percent(best['own'])} of the motion's size "
-            f"from the demonstrated start" + (f", {_percent(best['level'])} {where}." if count else ".")
+            f"{best['method']} {verb}: {what}, at a mean distance of {percent(best['own'])} of the motion's size "
+            f"from the demonstrated start" + (f", {percent(best['level'])} {where}." if count else ".")
         ]
     else:
         second = others[0]
         said = [
-            f"{best['method']} follows {what} best: {_percent(best['level'])} of the motion's size away on the mean "
-            f"{where}, before {second['method']} with {_percent(second['level'])}{_certainty(best, second, motions, rows)}."
+            f"{best['method']} follows {what} best: {percent(best['level'])} of the motion's size away on the mean "
+            f"{where}, before {second['method']} with {percent(second['level'])}"
+            f"{_certainty(best, second, motions, rows)}."
         ]
     notes = [note for text in rows.get("notes", []) if isinstance(text, str) for note in text.split("; ") if note]
-    if len(ranking) == 1 and notes:
+    if len(lines) == 1 and notes:
         said.append(f"Noted: {'; '.join(dict.fromkeys(notes))}.")
-    for line in ranking:
+    for line in lines:
         arrived, of = line["arrives"]
         if line["failed"]:
             said.append(f"{line['method']}: {line['failed']} of {of} motions fail or diverge.")
         elif arrived < of:
             said.append(f"{line['method']}: {of - arrived} of {of} motions do not arrive at the goal.")
         followed, fits = line["follows"]
-        if followed < fits and len(ranking) > 1:
-            said.append(f"{line['method']} does not follow in {fits - followed} of {fits} fits, by its own measurement.")
-    return said
+        if followed < fits and len(lines) > 1:
+            told = f"{fits - followed} of {fits} fits, by its own measurement"
+            said.append(f"{line['method']} does not follow in {told}.")
+    false = {(one["method"], claim) for one in _certificates(rows) for claim in one["false"]}
+    return said + [f"{method}: the certificate found false that {claim}." for method, claim in sorted(false)]
 
 
 def _certainty(
@@ -298,7 +310,7 @@ def _certainty(
     if len(motions) > 1:
         ahead = sum(_level(first) < _level(other) for first, other in pairs)
         return f", and nearer than that on {ahead} of {len(motions)}"
-    (first, other), = pairs
+    ((first, other),) = pairs
     if len(first) < 3 or len(first) != len(other) or (first == other).all():
         return ""
     p = float(stats.ttest_rel(first, other).pvalue)
@@ -315,18 +327,22 @@ def _certificates(rows: pd.DataFrame) -> list[dict[str, Any]]:
         text = of["certificate"].iloc[0]
         if isinstance(text, str):
             told = json.loads(text)
-            counts = [sum(line["verdict"] == verdict for line in told["lines"]) for verdict in ("proven", "not falsified")]
-            false = [line["claim"] for line in told["lines"] if line["verdict"] == "falsified"]
-            found.append({"motion": name, "method": label, "counts": counts, "false": false, "lines": told["lines"]})
+            lines = told["lines"]
+            counts = [[line["verdict"] for line in lines].count(kind) for kind in ("proven", "not falsified")]
+            false = [line["claim"] for line in lines if line["verdict"] == "falsified"]
+            found.append({"motion": name, "method": label, "counts": counts, "false": false, "lines": lines})
     return found
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]]:
+    """Names and texts, a line each; the innermost mappings in one."""
     lines: list[tuple[str, str]] = []
     for key, value in settings.items():
         name = f"{prefix}{key}"
-        if isinstance(value, Mapping):
+        if isinstance(value, Mapping) and any(isinstance(inside, Mapping) for inside in value.values()):
             lines += _flat(value, f"{name} · ")
+        elif isinstance(value, Mapping):
+            lines.append((name, ", ".join(f"{part} {inside}" for part, inside in value.items())))
         else:
             lines.append((name, ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)))
     return lines
@@ -340,7 +356,7 @@ def _drawn(
     rows: pd.DataFrame,
     paths: Mapping[tuple[str, str, int], Any],
     labels: Sequence[str],
-    motions: Sequence[_Motion],
+    n_motions: int,
 ) -> dict[str, Any]:
     """A motion and its rollouts as numbers for the page."""
     first = motion.shown[0]
@@ -352,11 +368,11 @@ def _drawn(
                 wanted = f"({motion.share * len(motion.shown)}, T, {first.dim})"
                 raise ValueError(f"paths: expected {wanted} for {label!r} and {name!r}, got {array.shape}")
             moved[label] = array
-    count, some = _thinned(motion, motions, len(labels))
+    count, some = _thinned(motion, n_motions * (1 + len(labels)))
     n_points = min((len(batch[0]) for batch in moved.values()), default=500)
     grid = _grid(first, min(count, n_points), n_points)
     chosen = np.unique(np.linspace(1, motion.share - 1, some).round().astype(int)) if some else np.empty(0, int)
-    starts = np.sort(np.concatenate([i * motion.share + np.r_[0, chosen] for i in range(len(motion.shown))])).astype(int)
+    starts = np.concatenate([i * motion.share + np.r_[0, chosen] for i in range(len(motion.shown))]).astype(int)
     shown = np.stack([one.at(grid * one.duration) for one in motion.shown])
     middle, half = (shown.min((0, 1)) + shown.max((0, 1))) / 2, motion.size / 2 * WIDER
     low, high = middle - half, middle + half
@@ -384,9 +400,9 @@ def _drawn(
     }
 
 
-def _thinned(motion: _Motion, motions: Sequence[_Motion], n_methods: int) -> tuple[int, int]:
-    """Points of each rollout, and rollouts beside each demonstrated start, that there is room for."""
-    room = ROOM * 3 / 4 / 2 / len(motions) / n_methods / motion.shown[0].dim / len(motion.shown)
+def _thinned(motion: _Motion, parts: int) -> tuple[int, int]:
+    """Points of each rollout, and rollouts beside each demonstrated start, for which ``parts`` parts of ROOM do."""
+    room = ROOM * 3 / 4 / 2 / parts / motion.shown[0].dim / len(motion.shown)
     some = motion.share - 1
     if room / (1 + some) < FEWEST:
         some = max(0, min(some, int(room / FEWEST) - 1))
@@ -403,7 +419,9 @@ def _grid(shown: Demonstration, count: int, n_points: int) -> Array:
     return even[np.unique(np.searchsorted(passed, np.linspace(0, passed[-1], count)).clip(0, n_points - 1))]
 
 
-def _rollouts(batch: Array, starts: NDArray[Any], grid: Array, duration: float, low: Array, high: Array) -> dict[str, Any]:
+def _rollouts(
+    batch: Array, starts: NDArray[Any], grid: Array, duration: float, low: Array, high: Array
+) -> dict[str, Any]:
     even = np.linspace(0, 1, batch.shape[1])
     nearest = np.searchsorted(even, grid - 1e-9).clip(0, len(even) - 1)
     with np.errstate(all="ignore"):
@@ -427,7 +445,8 @@ def _quantized(values: Array, low: Array, high: Array) -> NDArray[np.int16]:
     with np.errstate(invalid="ignore"):
         inside = np.all((values >= low) & (values <= high), axis=-1, keepdims=True)
         share = np.where(inside, (values - low) / (high - low), 0.0)
-    return np.where(inside, np.round(65534 * share) - 32767, GAP).astype(np.int16)
+    whole: NDArray[np.int16] = np.where(inside, np.round(65534 * share) - 32767, GAP).astype(np.int16)
+    return whole
 
 
 def _packed(values: NDArray[Any], dtype: str) -> str:
@@ -447,13 +466,19 @@ def _axes(dim: int) -> list[str]:
 
 
 def _page(**told: Any) -> str:
+    try:
+        from jinja2 import Environment, StrictUndefined
+        from markupsafe import Markup
+        from plotly.offline import get_plotlyjs
+    except ImportError as error:
+        raise ImportError(f"reports need {error.name}: pip install 'latentds[cli]'") from error
     here = Path(__file__).parent
     style, script = ((here / f"page.{kind}").read_text(encoding="utf-8") for kind in ("css", "js"))
     plotly = get_plotlyjs()
     hashes = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (plotly, script)]
     pages = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     pages.policies["json.dumps_kwargs"] = {"allow_nan": False}
-    pages.filters["percent"] = _percent
+    pages.filters["percent"] = percent
     page = pages.from_string((here / "page.html").read_text(encoding="utf-8"))
     return page.render(
         style=Markup(style),

@@ -105,7 +105,7 @@
     const layout = { margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: motion.name + axes, showlegend: false, hovermode: "closest" };
     if (solid) {
       const axis = (k) => ({ ...quiet, title: title(k), showbackground: false, nticks: 5, showspikes: false });
-      layout.scene = { xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), aspectmode: motion.dim === 3 ? "data" : "cube", camera: { eye: { x: 1.25, y: -1.45, z: 0.85 } }, uirevision: motion.name };
+      layout.scene = { xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), aspectmode: motion.dim === 3 ? "data" : "cube", camera: { eye: { x: 1.35, y: -1.6, z: 0.9 }, center: { x: 0, y: 0, z: -0.12 } }, uirevision: motion.name };
     } else {
       layout.margin = { l: 10, r: 10, t: 10, b: 10 };
       layout.xaxis = { ...quiet, title: title(0), zeroline: false };
@@ -187,16 +187,17 @@
   }
 
   function drawJoints() {
-    const columns = innerWidth > 900 && motion.dim > 3 ? 2 : 1, rows = Math.ceil(motion.dim / columns);
+    const count = Math.min(motion.dim, 24), columns = innerWidth > 900 && count > 3 ? 2 : 1, rows = Math.ceil(count / columns);
+    find("coordinate-note").textContent = count < motion.dim ? `The first ${count} of ${motion.dim}.` : "";
     const traces = [], layout = { margin: { l: 10, r: 10, t: 10, b: 10 }, showlegend: true, legend: { orientation: "h", y: 1.01, yanchor: "bottom" }, hovermode: "x unified", grid: { rows, columns, pattern: "independent", ygap: rows > 1 ? 0.12 : 0, xgap: 0.1 } };
-    for (let k = 0; k < motion.dim; k++) {
+    for (let k = 0; k < count; k++) {
       const id = k ? k + 1 : "", more = { xaxis: `x${id}`, yaxis: `y${id}`, showlegend: !k };
       motion.shown.forEach((path, i) => traces.push(shownLine(timesOf(motion.shown_durations[i]), path[k], { ...more, showlegend: !k && !i })));
       for (const m of movers()) traces.push(ownLine(m, timesOf(motion.durations[0]), motion.methods[m].paths[0][k], more));
-      layout[`xaxis${id}`] = { ...quiet, zeroline: false, ...(k >= motion.dim - columns ? { title: { text: "time [s]" } } : { showticklabels: false }) };
+      layout[`xaxis${id}`] = { ...quiet, zeroline: false, ...(k >= count - columns ? { title: { text: "time [s]" } } : { showticklabels: false }) };
       layout[`yaxis${id}`] = { ...quiet, zeroline: false, nticks: 5, title: { text: plain(motion.columns[k]) } };
     }
-    layout.height = 60 + (motion.dim === 1 ? 300 : 150) * rows;
+    layout.height = 60 + (count === 1 ? 300 : 150) * rows;
     Plotly.react("joints", traces, layout, config);
   }
 
