@@ -4,7 +4,7 @@ BIN := .venv/bin
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help compare test test-fast check speed ablation fuzz paper training lasa clean
+.PHONY: help compare test test-fast check speed ablation fuzz paper training hard-curves lasa clean
 
 help: # What there is to make.
 	@grep -E '^[a-z -]+:.*# ' $(MAKEFILE_LIST) | sed -E 's/^([a-z -]+):[^#]*# (.*)/\1|\2/' | awk -F'|' '{printf "  make %-34s %s\n", $$1, $$2}'
@@ -26,6 +26,9 @@ check: .venv/installed # Linters and types.
 
 speed ablation fuzz paper training: .venv/installed # The studies: see the top of experiments/NAME.
 	$(BIN)/python -m experiments.$@ $(ARGS)
+
+hard-curves: .venv/installed # Seventy curves that are hard to learn from: which of them TubeDS follows.
+	$(BIN)/python -m experiments.hard_curves $(ARGS)
 
 lasa: .venv/installed # LASA handwriting (free for non-commercial academic use), for the studies that can use it.
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev,lasa]'

@@ -3,9 +3,9 @@
     python -m experiments.ablation [--quick] [--out results/ablation] [--data FOLDER_OR_FILE ...] [--jobs 2]
 
 LASA needs ``make lasa`` once and is left out without it. A recording is any file that ``Demonstration.load`` reads; a
-folder gives all its .npz and .csv files; without any, three made-up arm motions stand in. Leaves rows.csv, summary.md,
-settings.json and pictures in ``--out``; finished cells stay in cells.sqlite there, so that the same command goes on
-where it was interrupted.
+folder gives all of its that are of such a kind; without any, three made-up arm motions stand in. Leaves rows.csv,
+summary.md, settings.json and pictures in ``--out``; finished cells stay in cells.sqlite there, so that the same command
+goes on where it was interrupted.
 """
 
 from __future__ import annotations

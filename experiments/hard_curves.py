@@ -2,8 +2,9 @@
 
     python -m experiments.hard_curves [--quick] [--out results/hard-curves]
 
-Prints a line per curve and leaves rows.csv in ``--out``. "Follows" means: from the demonstrated start, the exact DTW
-to the curve without its noise over 400 points is within 1 % of its size. A miss that no note tells is a silent one.
+Prints a line per curve and per kind of them, and leaves rows.csv in ``--out``. "Follows" means: from the demonstrated
+start, the exact DTW to the curve without its noise over 400 points is within 1 % of its size. A miss that no note tells
+is a silent one.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from experiments import report
 from latentds import Demonstration, FitWarning, TubeDS, datasets, metrics
+from latentds.demonstration import arc_lengths
 from latentds.methods.tube import TubeReport
 
 Array = NDArray[np.float64]
@@ -29,6 +31,22 @@ Array = NDArray[np.float64]
 FOLLOWS = 0.01
 """Largest exact DTW per point, in sizes of the motion."""
 POINTS = 400
+REFUSED = "refused: "
+KINDS = {
+    "noise": ("noise",),
+    "steps": ("quantised",),
+    "few or many points": ("points",),
+    "spiral": ("spiral", "stable c="),
+    "knot": ("knot",),
+    "Lissajous": ("Lissajous",),
+    "near crossing": ("eight in space", "loop-the-loop"),
+    "nearly closed": ("circle",),
+    "turning back": ("hook", "hairpin", "switchbacks"),
+    "helix": ("helix",),
+    "wave": ("sine", "wave"),
+    "random": ("random",),
+}
+"""Words of the names of each kind of curve; the first that fits."""
 
 
 class Curve(NamedTuple):
@@ -144,7 +162,7 @@ def _spoiled(draw: np.random.Generator) -> Iterator[tuple[str, Array, Array]]:
 
 
 def _even_way(path: Array) -> Array:
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    arc = arc_lengths(path)
     return np.stack([np.interp(np.linspace(0, arc[-1], len(path)), arc, column) for column in path.T], axis=1)
 
 
@@ -186,13 +204,13 @@ def row(curve: Curve) -> dict[str, Any]:
     """What became of one curve."""
     shown, clean = curve
     began = time.perf_counter()
-    told: dict[str, Any] = {"curve": shown.name, "dim": shown.dim, "points": len(shown)}
+    told: dict[str, Any] = {"curve": shown.name, "kind": kind_of(shown.name), "dim": shown.dim, "points": len(shown)}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FitWarning)  # the row tells it
             ds = TubeDS(shown.dim).fit(shown)
     except ValueError as error:
-        return told | {"seconds": time.perf_counter() - began, "note": f"refused: {error}"}
+        return told | {"follows": False, "seconds": time.perf_counter() - began, "note": f"{REFUSED}{error}"}
     seconds = time.perf_counter() - began
     times = np.linspace(0, clean.duration, POINTS)
     with torch.no_grad():
@@ -211,6 +229,25 @@ def row(curve: Curve) -> dict[str, Any]:
         "condition": fit.condition_path,
         "note": "; ".join(fit.notes),
     }
+
+
+def kind_of(name: str) -> str:
+    return next(kind for kind, words in KINDS.items() if any(word in name for word in words))
+
+
+def by_kind(table: pd.DataFrame) -> pd.DataFrame:
+    """A row per kind: how many curves follow, miss and say so, miss silently, are refused; median seconds of a fit."""
+    note, follows = table["note"], table["follows"].astype(bool)
+    refused = note.str.startswith(REFUSED)
+    became = {
+        "follow": follows,
+        "miss, noted": ~follows & ~refused & note.ne(""),
+        "miss silently": ~follows & note.eq(""),
+        "refused": refused,
+    }
+    kinds = table["kind"]
+    counts = pd.DataFrame(became).groupby(kinds, sort=False).sum()
+    return counts.assign(**{"median seconds": table["seconds"].groupby(kinds, sort=False).median()})
 
 
 def main(
@@ -233,10 +270,11 @@ def main(
     table = pd.DataFrame(rows)
     out.mkdir(parents=True, exist_ok=True)
     report.write(out / "rows.csv", table.to_csv(index=False))
-    follows = table["follows"].eq(True)
-    silent = ~follows & table["note"].eq("")
+    kinds = by_kind(table)
+    print(f"\n{kinds.to_string(float_format='{:.1f}'.format)}\n")
     took = f"{table['seconds'].median():.1f} s in the median, {table['seconds'].max():.1f} s at most"
-    print(f"{follows.sum()} of {len(table)} follow; {silent.sum()} miss silently; fits took {took}")
+    counts = kinds.sum().astype(int)
+    print(f"{counts['follow']} of {len(table)} follow; {counts['miss silently']} miss silently; fits took {took}")
 
 
 if __name__ == "__main__":

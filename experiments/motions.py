@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from latentds import Demonstration, datasets
+from latentds.readers import READERS
 
 
 def spirals(quick: bool) -> list[Demonstration]:
@@ -34,15 +35,18 @@ def handwriting() -> dict[str, list[Demonstration]]:
 
 
 def recordings(paths: Sequence[Path]) -> list[Demonstration]:
-    """What the files hold, and all .npz and .csv files of the folders, in alphabetical order.
+    """What the files hold, and all files of the folders that a demonstration is read from, in alphabetical order.
 
     Raises:
         ValueError: if there is none, one is no recording, or two have one name.
         FileNotFoundError: if there is no such file.
     """
-    files = [f for p in paths for f in (sorted(p.iterdir()) if p.is_dir() else [p]) if f.suffix in (".npz", ".csv")]
+    every = [file for path in paths for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
+    files = [file for file in every if file.suffix.lower() in READERS]
     if paths and not files:
-        raise ValueError(f"data: expected .npz or .csv files, found none in {', '.join(map(str, paths))}")
+        raise ValueError(
+            f"data: expected files of kind {' '.join(READERS)}, found none in {', '.join(map(str, paths))}"
+        )
     found = [Demonstration.load(file) for file in files]
     if twice := [name for name, count in Counter(d.name for d in found).items() if count > 1]:
         raise ValueError(f"data: expected recordings of different names, got {twice[0]!r} again")

@@ -29,7 +29,7 @@ from rich.table import Table
 from rich.text import Text
 from typer.core import TyperGroup
 
-from . import fidelity, recordings, storage
+from . import fidelity, readers, storage
 from .base import FitReport, StableDS
 from .benchmark import Cell, Factory, Protocol, run
 from .cell import interrupts_kept
@@ -142,7 +142,7 @@ class Reading:
         for path in paths:
             names: set[str] = set()
             if any(name.isdigit() for name in [*(self.columns or ()), self.time or ""]):
-                names = set(recordings.read_table(path))  # a column called "3" is meant before the fourth one
+                names = set(readers.read_table(path))  # a column called "3" is meant before the fourth one
             number = partial(_name_or_number, names=names)
             columns = None if self.columns is None else [number(name) for name in self.columns]
             time = None if self.time is None else number(self.time)
@@ -214,7 +214,7 @@ def _literal(text: str) -> Any:
 
 def is_system(paths: Sequence[Path]) -> bool:
     """Whether it is one file of a kind that no recording has."""
-    return len(paths) == 1 and paths[0].suffix.lower() not in recordings.READERS
+    return len(paths) == 1 and paths[0].suffix.lower() not in readers.READERS
 
 
 def loaded(path: Path, method: str = "") -> tuple[StableDS, list[Demonstration]]:
@@ -322,7 +322,7 @@ def fit(
     latentds fit mine.csv --method Chebyshev,n_layers=200
     """
     path = target(out, files, ".safetensors")
-    if path.suffix.lower() in recordings.READERS:
+    if path.suffix.lower() in readers.READERS:
         raise ValueError(f"out: expected a name that no recording has, such as mine.safetensors, got {path.name!r}")
     make = method_of(method)
     shown = Reading(columns, time, unit, dt)(files)

@@ -13,7 +13,7 @@ import torch
 from scipy.interpolate import CubicSpline
 
 from .arguments import number_in, whole_number
-from .demonstration import Demonstration
+from .demonstration import Demonstration, arc_lengths
 
 UNSTABLE_COMPLEXITIES = (1, 3, 7, 10, 15)
 STABLE_COMPLEXITIES = (1, 2, 3, 5, 7)
@@ -122,7 +122,7 @@ def drawn(name: str, n_points: int = 1000) -> Demonstration:
         raise ValueError(f"name: expected one of {', '.join(STROKES)}, got {name!r}")
     count = whole_number(n_points, "n_points", at_least=3)
     pen = np.array(STROKES[name])
-    chords = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(pen, axis=0), axis=1))])
+    chords = arc_lengths(pen)
     share = np.linspace(0, 1, count)
     eased = share**3 * (10 - 15 * share + 6 * share**2)  # least jerk from rest to rest
     return Demonstration(CubicSpline(chords, pen)(eased * chords[-1]), 4 / (count - 1), name)

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from . import files, recordings
+from . import files, readers, recordings
 from .arguments import point_array, positive, real_array
 
 logger = logging.getLogger(__name__)
@@ -175,7 +175,7 @@ class Demonstration:
             FileNotFoundError: if there is no such file.
         """
         path = Path(path)
-        table = recordings.read_table(path)
+        table = readers.read_table(path)
         if name is None:
             saved = table.get("name", np.array(0))
             name = str(saved) if saved.ndim == 0 and saved.dtype.kind == "U" else path.stem
@@ -194,7 +194,7 @@ class Demonstration:
         name: str = "",
     ) -> Demonstration:
         """What :meth:`load` does, for a pandas frame or a mapping from names to arrays that is at hand already."""
-        known = recordings.as_table(table)
+        known = readers.as_table(table)
         motion = recordings.understand(known, name or "the table", columns=columns, time=time, unit=unit, dt=dt)
         return cls._of(motion, name)
 
@@ -240,9 +240,20 @@ def demonstrations_of(demonstration: Any, dim: int) -> list[Demonstration]:
     return list(found)
 
 
-def jitter(positions: NDArray[np.float64]) -> float:
-    """Length of the noise in a recording (N, n), read off its second differences: in the units of the positions."""
-    return float(np.median(np.linalg.norm(np.diff(positions, 2, axis=0), axis=1)) / math.sqrt(6))
+def arc_lengths(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Length of the polygon through points (N, n) up to each of them, from 0: (N,)."""
+    lengths: NDArray[np.float64] = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(lengths)])
+
+
+def jitter(positions: NDArray[np.float64], order: int = 2) -> float:
+    """Length of the noise in a recording (N, n), in the units of the positions.
+
+    Read off its differences of that order k, N > k, in which a motion like a polynomial of a lower degree does not
+    show: those of white noise of standard deviation s have s √C(2k, k).
+    """
+    differences = np.linalg.norm(np.diff(positions, order, axis=0), axis=1)
+    return float(np.median(differences)) / math.sqrt(math.comb(2 * order, order))
 
 
 def goal_apart(shown: Demonstration, goal: Tensor) -> float:

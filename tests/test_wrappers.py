@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import latentds
 from baselines import FDM, SDSEF
 from latentds import Demonstration, TubeDS, certify
 from latentds.base import MovedDS
+from latentds.fidelity import Excerpt
 from latentds.testing import parametrize_stable_ds, wavy_motion
 
 F64 = torch.float64
@@ -135,6 +137,43 @@ def test_it_learns_what_it_is_shown():
     assert moved.fit_report_is_current
     several = Demonstration(shown.positions + 0.1 * (1 - torch.linspace(0, 1, len(shown)).unsqueeze(1)), shown.dt)
     assert torch.allclose(moved.fit([shown, several]).attractor, shown.goal)
+
+
+def test_its_report_names_what_it_was_shown_not_what_the_system_inside_was():
+    several = [wavy_motion(2), replace(wavy_motion(2, seed=1), name="another")]
+    moved = KINDS["TubeDS"](2).transformed(rotation=turn(2), translation=[3.0, 1.0], scale=0.2).slowed(4.0)
+    for shown in (several[:1], several):
+        learned = moved.fit(shown).fit_report.learned_from
+        assert learned == tuple(one.fingerprint for one in shown)
+
+
+def test_its_excerpts_are_those_of_the_motion_moved():
+    """As if the motion itself had been turned, scaled and slowed before it was looked at."""
+    shown, rotation, translation = wavy_motion(2), turn(2), torch.tensor([3.0, 1.0], dtype=F64)
+    inside = KINDS["FDM"](2).fit(shown)
+    moved = inside.transformed(rotation=rotation, translation=translation, scale=0.2).slowed(4.0)
+    expected = Excerpt.of(Demonstration(0.2 * shown.positions @ rotation.T + translation, 4 * shown.dt))
+    (found,) = moved.excerpts()
+    np.testing.assert_allclose(found.path, expected.path, atol=1e-12)
+    for name in ("duration", "fastest", "ruler"):
+        assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-6)
+    assert FDM(2).slowed(2.0).excerpts() == ()
+
+
+@torch.no_grad()
+def test_its_latent_error_is_that_of_the_motion_inside(draw):
+    """Where and when the system inside is asked, told by an answer that depends on both."""
+
+    class Telling(FDM):
+        def latent_error(self, y0, t):
+            return torch.linalg.vector_norm(self.latent_motion(y0, t), dim=-1)
+
+    inside, rotation, translation = Telling(2, n_layers=12).fit(wavy_motion(2)), turn(2), torch.tensor([3.0, 1.0])
+    moved = inside.transformed(rotation=rotation, translation=translation, scale=2.0).slowed(4.0)
+    y, times = torch.randn(5, 2, generator=draw, dtype=F64), torch.linspace(0, 2, 7, dtype=F64)
+    found = moved.latent_error(2 * y @ rotation.T + translation, 4 * times)
+    assert found.std() > 0.01
+    torch.testing.assert_close(found, inside.latent_error(y, times))
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])

@@ -32,7 +32,7 @@ def main(
     doc: Annotated[
         Path | None, typer.Option(help="The report; docs/reproduction.md, or with --quick in --out.")
     ] = None,
-    data: Annotated[Path | None, typer.Option(help="Folder of .npz or .csv joint motions, for ours.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder or file of joint motions, for ours.")] = None,
     jobs: Annotated[int | None, typer.Option(help="Processes; all cores by default.")] = None,
 ) -> None:
     """Reproduce the paper. An interrupted run goes on where it stopped."""

@@ -19,10 +19,7 @@ from experiments.methods import GREEDY
 from experiments.published import Setting
 from latentds import Demonstration
 from latentds.fitting.matching import add_greedy_layers
-from latentds.fitting.tuning import BETAS, DEPTHS, GOOD, MUS
-from latentds.fitting.tuning import Choice as Choice
-from latentds.fitting.tuning import Tried as Tried
-from latentds.fitting.tuning import choose as choose
+from latentds.fitting.tuning import BETAS, DEPTHS, GOOD, MUS, Tried
 from latentds.store import fingerprint
 
 Array = NDArray[np.float64]

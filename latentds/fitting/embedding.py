@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from ..arguments import whole_number
-from ..demonstration import jitter
+from ..demonstration import arc_lengths, jitter
 
 Array = NDArray[np.float64]
 
@@ -96,7 +96,7 @@ def arc_length_path(positions: Array, times: Array, n_points: int) -> tuple[Arra
     if len(kept) > 1 and np.linalg.norm(positions[-1] - positions[kept[-1]]) < apart / 2:
         kept.pop()
     points = np.concatenate([positions[kept], positions[-1:]])
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    arc = arc_lengths(points)
     even = np.linspace(0, arc[-1], n_points)
     path = np.stack([np.interp(even, arc, column) for column in points.T], axis=1)
     return path, 1 - arc / arc[-1], times[[*kept, last]] - times[0]

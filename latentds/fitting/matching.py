@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
@@ -45,6 +45,11 @@ def add_greedy_layers(
     return Layers(rows[:used, :dim], rows[:used, dim:-1], np.sqrt(rows[:used, -1])), moved
 
 
+def stacked(parts: Sequence[Layers]) -> Layers:
+    """The layers of all parts, at least one, in their order."""
+    return Layers(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
 def match_along(curves: Array, n_layers: int, beta: float, mu: float, narrowest: float = 0.0) -> Layers:
     """Greedy matching of the first curve to the last by way of those between, (K+1, N, n).
 
@@ -59,7 +64,7 @@ def match_along(curves: Array, n_layers: int, beta: float, mu: float, narrowest:
         parts.append(layers)
     left = n_layers - sum(len(layers.widths) for layers in parts)
     parts.append(add_greedy_layers(moved, targets[-1], left, beta, mu, narrowest)[0])
-    return Layers(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    return stacked(parts)
 
 
 STRIDE = 0.3
@@ -111,7 +116,7 @@ def track(curves: Array, most: int, narrowest: float) -> Layers | None:
             parts.append(layers)
             used += len(layers.widths)
         at, here = ahead, there
-    return Layers(*(np.concatenate(columns) for columns in zip(*parts, strict=True))) if parts else None
+    return stacked(parts) if parts else None
 
 
 PINS = 2
@@ -128,7 +133,7 @@ def pin_ends(layers: Layers, x: Array, y: Array, mu: float) -> Layers:
     for at in (0, len(x) - 1):
         pin, moved = add_greedy_layers(moved, y, 1, 1.0, mu, at=at)
         parts.append(pin)
-    return Layers(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    return stacked(parts)
 
 
 @torch.no_grad()

@@ -7,6 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ..demonstration import arc_lengths
+
 Array = NDArray[np.float64]
 
 
@@ -52,7 +54,7 @@ class Strands:
 
     def _apart(self, curve: Array) -> NDArray[np.bool_]:
         """Which pairs of segments are of two strands of this curve, by their middles."""
-        arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])[self.chosen]
+        arc = arc_lengths(curve)[self.chosen]
         middle, along = (curve[self.chosen][1:] + curve[self.chosen][:-1]) / 2, (arc[1:] + arc[:-1]) / 2
         first, second = self.pairs
         squared = sum((column[second] - column[first]) ** 2 for column in middle.T)
@@ -65,7 +67,7 @@ def crowded(curve: Array, most: int) -> Array:
 
     Even in arc length but for that; as many as leave half of the clearance between two of them, from 600 on.
     """
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    arc = arc_lengths(curve)
     density = np.maximum(600 / arc[-1], 2 / np.maximum(Strands(curve, 600).clearance(curve), 1e-12))
     count = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(arc))])
     even = np.interp(np.linspace(0, count[-1], min(most, math.ceil(count[-1]) + 1)), count, arc)
@@ -76,6 +78,6 @@ def crowded(curve: Array, most: int) -> Array:
 
 def progress_along(curve: Array) -> Array:
     """Share of the length of a curve (N, n) up to each of its points, 0 to 1: (N,)."""
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    arc = arc_lengths(curve)
     share: Array = arc / arc[-1]
     return share

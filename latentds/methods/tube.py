@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..arguments import number_in
 from ..base import FitReport, LatentDS
-from ..demonstration import Demonstration, demonstrations_of
+from ..demonstration import Demonstration, demonstrations_of, jitter
 from ..diffeomorphism import Layers, LocallyWeightedTranslations
 from ..dynamics import TubeDynamics
 from ..fidelity import Excerpt, measure
@@ -373,7 +373,7 @@ def _blur(shown: Demonstration) -> str:
     positions = shown.positions.numpy()
     if len(positions) < 10:
         return ""
-    noise = float(np.median(np.linalg.norm(np.diff(positions, 4, axis=0), axis=1))) / math.sqrt(70) / shown.size
+    noise = jitter(positions, 4) / shown.size
     if noise > BLURRED:
         return f"noise of {noise:.2g} of its size hides the motion"
     moves = np.abs(np.diff(positions, axis=0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
@@ -72,5 +73,22 @@ def assert_same_velocity():
         assert torch.isfinite(expected).all()
         error = (torch.as_tensor(found, dtype=torch.float64) - expected.double()).abs().max()
         assert error <= limit * torch.linalg.vector_norm(expected.double(), dim=-1).max()
+
+    return check
+
+
+@pytest.fixture
+def assert_spoils_its_row_alone(positions):
+    """A position that is not finite has a velocity of NaN and changes no other, not by a bit."""
+
+    def check(run, ds, dtype=torch.float64):
+        points = positions(ds).to(dtype)
+        expected = run(ds, points)
+        spoiled = {4: np.nan, 7: np.inf, 12: -np.inf}
+        for row, bad in spoiled.items():
+            points[row, row % ds.dim] = bad
+        found = run(ds, points)
+        assert np.isnan(found[list(spoiled)]).all()
+        assert np.array_equal(np.delete(found, list(spoiled), 0), np.delete(expected, list(spoiled), 0))
 
     return check

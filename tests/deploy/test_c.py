@@ -84,16 +84,9 @@ def test_ten_thousand_points(make_field, positions, run, assert_same_velocity):
     assert_same_velocity(run(ds, points), ds, points, 1e-12)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_positions_that_are_not_finite(bad, dtype, make_field, positions, run):
-    ds = make_field(3)
-    points = positions(ds).numpy().astype(dtype)
-    expected = run(ds, points)
-    points[4, 1] = bad
-    found = run(ds, points)
-    assert np.isnan(found[4]).all()
-    assert np.array_equal(np.delete(found, 4, 0), np.delete(expected, 4, 0))
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_positions_that_are_not_finite(dtype, make_field, run, assert_spoils_its_row_alone):
+    assert_spoils_its_row_alone(run, make_field(3), dtype)
 
 
 def test_at_rest_and_very_far(dynamics, make_field, run):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+
+import numpy as np
 import pytest
 
 from experiments import motions
@@ -24,7 +27,15 @@ def test_recordings_are_read_from_files_and_folders(tmp_path):
     assert [shown.name for shown in motions.recordings([tmp_path / "two.npz"])] == ["two"]
     with pytest.raises(ValueError, match="data: expected recordings of different names"):
         motions.recordings([tmp_path, tmp_path / "one.csv"])
-    with pytest.raises(ValueError, match=r"data: expected \.npz or \.csv files, found none in .*nothing"):
+    with pytest.raises(ValueError, match=r"data: expected files of kind \.csv .*\.npz.*, found none in .*nothing"):
         motions.recordings([tmp_path / "nothing"])
     with pytest.raises(FileNotFoundError):
         motions.recordings([tmp_path / "nothing.npz"])
+
+
+def test_recordings_of_every_kind_that_a_demonstration_is_read_from(tmp_path):
+    shown = wavy_motion(2)
+    (tmp_path / "one.JSON").write_text(json.dumps({"dt": shown.dt, "positions": shown.positions.tolist()}))
+    (tmp_path / "read me.md").write_text("no recording")
+    np.savetxt(tmp_path / "two.txt", np.column_stack([shown.times, shown.positions]), header="t [s] x y")
+    assert [found.positions.tolist() for found in motions.recordings([tmp_path])] == 2 * [shown.positions.tolist()]

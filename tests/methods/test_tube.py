@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
+import re
 
 import numpy as np
 import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from latentds import Demonstration, datasets
+from latentds import Demonstration, FitWarning, datasets
 from latentds.dynamics import Frame, TubeDynamics
 from latentds.fitting.embedding import arc_length_path
-from latentds.methods.tube import TubeDS, mean_motion
+from latentds.methods import tube
+from latentds.methods.tube import TubeDS, _blur, mean_motion
 from latentds.metrics import dtw
 from latentds.testing import wavy_motion
 from latentds.time_law import PiecewiseLinearLaw
@@ -468,3 +471,50 @@ def test_an_easy_motion_takes_300_layers_and_what_is_asked_for_is_kept(tmp_path)
     fresh.load_state_dict(chosen.state_dict())
     assert torch.equal(rolled(fresh, shown), rolled(chosen, shown))
     assert TubeDS(2, n_layers=20, refined=False).fit(shown).diffeomorphism.n_layers == 20
+
+
+def wave(count=400):
+    """A path in space, (N, 3), of size 2."""
+    t = np.linspace(0, 1, count)
+    return np.stack([2 * t, 0.4 * np.sin(6 * np.pi * t), 0.2 * np.cos(5 * t)], 1)
+
+
+def noisy(path, share):
+    return path + share * 2 * np.random.default_rng(0).standard_normal(path.shape)
+
+
+def in_steps(path, share):
+    return share * 2 * np.round(path / (share * 2))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [(noisy, "noise of ([0-9.]+) of its size hides"), (in_steps, "recorded in steps of ([0-9.]+) of")],
+)
+def test_what_hides_the_motion_is_told_with_its_size(spoil, told):
+    for share in (0.03, 0.05):
+        shown = Demonstration(spoil(wave(), share), 0.01)
+        # The noise of a point is the median length of three coordinates' noise; a step is one coordinate's.
+        expected = share * 2 / shown.size * (1.54 if spoil is noisy else 1)
+        assert float(re.match(told, _blur(shown))[1]) == pytest.approx(expected, rel=0.1)
+    assert _blur(Demonstration(spoil(wave(), 0.005), 0.01)) == ""
+    assert _blur(Demonstration(wave(), 0.01)) == _blur(Demonstration(wave(9), 0.01)) == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("spoil", [noisy, in_steps])
+def test_a_fit_to_a_blurred_recording_says_so_and_searches_no_deeper(spoil, monkeypatch):
+    monkeypatch.setattr(tube, "_deeper", None)
+    shown = Demonstration(spoil(wave(), 0.05), 0.01)
+    with pytest.warns(FitWarning) if spoil is noisy else contextlib.nullcontext():
+        ds = TubeDS(3, refined=False).fit(shown)
+    assert ds.fit_report.notes[0] == _blur(shown) != ""
+    assert ds.fit_report.n_layers <= tube.DEPTHS[0]
+
+
+def test_a_search_that_runs_out_of_time_says_so(monkeypatch):
+    monkeypatch.setattr(tube, "SEARCH_SECONDS", 1e-3)
+    with pytest.warns(FitWarning):
+        notes = TubeDS(2, refined=False).fit(planar_spiral(1.5)).fit_report.notes
+    assert notes[0].startswith("no match tried follows the path closely; its strands come within ")
+    assert notes[1] == "the search for a match stopped after 0.001 s"
