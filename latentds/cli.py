@@ -604,19 +604,20 @@ def compared(
 
 
 def tell_rows(rows: pd.DataFrame, shown: Sequence[Any]) -> None:
-    from .report import percent, ranking, verdict
+    from .report import Comparison, percent, verdict
 
+    found = Comparison(rows, shown)
     titles = "around", "± sd", "worst", "shown start", "end", "arrive", "follow", "fit [s]"
     table = Table("method", *titles, title="Distances (exact DTW over points) in percent of the motion's size")
     table.columns[0].overflow = "fold"
     for column in table.columns[1:]:
         column.justify = "right"
-    for line in ranking(rows, shown):
+    for line in found.ranking():
         shares = [percent(line[key]) for key in ("level", "spread", "worst", "own", "end")]
         counts = ["{} of {}".format(*line[key]) for key in ("arrives", "follows")]
         table.add_row(Text(line["method"]), *shares, *counts, f"{line['seconds']:.2g}")
     tell(table)
-    for sentence in verdict(rows, shown):
+    for sentence in verdict(found):
         tell(sentence)
 
 

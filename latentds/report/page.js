@@ -147,8 +147,15 @@
     playing = requestAnimationFrame(step);
   }
 
+  /** 1, 2, 5, 10, … around two numbers > 0; powers of ten alone if they are far apart. */
+  function ticks(low, high) {
+    const steps = high > 300 * low ? [1] : [1, 2, 5], found = [];
+    for (let k = Math.floor(Math.log10(low)); k <= Math.ceil(Math.log10(high)); k++) for (const step of steps) found.push(Number(`${step}e${k}`));
+    return found;
+  }
+
   function drawDistances() {
-    const traces = [], chosen = all.filter((m) => on.has(m)), names = chosen.map((m) => plain(labels[m]));
+    const traces = [], chosen = all.filter((m) => on.has(m) && motion.scores[m]), names = chosen.map((m) => plain(labels[m]));
     const mean = (values) => (values.length && !values.includes(null) ? values.reduce((a, b) => a + b, 0) / values.length : null);
     const around = chosen.map((m) => motion.scores[m].others), own = chosen.map((m) => motion.scores[m].own);
     const judged = around.map((values, i) => (values.length ? values : own[i]));
@@ -167,7 +174,7 @@
     Plotly.react("distances", traces, {
       margin: { l: 10, r: 10, t: 10, b: 10 }, showlegend: false, bargap: 0.4,
       xaxis: { ...quiet, type: "category", range }, xaxis2: { overlaying: "x", range, visible: false, fixedrange: true },
-      yaxis: { ...quiet, type: log ? "log" : "linear", title: { text: "distance [% of the size]" }, ...(log ? { dtick: high > 300 * low ? 1 : "D2", range: [Math.log10(low) - 0.3, Math.log10(high) + 0.15] } : { rangemode: "tozero" }) },
+      yaxis: { ...quiet, type: log ? "log" : "linear", title: { text: "distance [% of the size]" }, ...(log ? { tickvals: ticks(low, high), range: [Math.log10(low) - 0.3, Math.log10(high) + 0.15] } : { rangemode: "tozero" }) },
     }, config);
   }
 
