@@ -21,6 +21,13 @@ from .comparison import Comparison
 from .drawn import drawn
 from .verdict import percent, verdict
 
+try:
+    from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup
+    from plotly.offline import get_plotlyjs
+except ImportError as error:
+    raise ImportError(f"reports need {error.name}: pip install 'latentds[cli]'") from error
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -54,7 +61,6 @@ def write(
 
     Raises:
         ValueError: if an argument is none of this, or the demonstrations do not fit the rows.
-        ImportError: without plotly and jinja2: ``pip install 'latentds[cli]'``.
     """
     found = Comparison(rows, demonstrations)
     colors = _colors(found.methods)
@@ -128,12 +134,6 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]
 
 
 def _page(**told: Any) -> str:
-    try:
-        from jinja2 import Environment, StrictUndefined
-        from markupsafe import Markup
-        from plotly.offline import get_plotlyjs
-    except ImportError as error:
-        raise ImportError(f"reports need {error.name}: pip install 'latentds[cli]'") from error
     here = Path(__file__).parent
     style, script = ((here / f"page.{kind}").read_text(encoding="utf-8") for kind in ("css", "js"))
     plotly = get_plotlyjs()

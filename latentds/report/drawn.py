@@ -88,7 +88,8 @@ def _grid(shown: Demonstration, count: int, n_points: int) -> Array:
         return even
     steps = np.linalg.norm(np.diff(shown.at(even * shown.duration), axis=0), axis=1)
     passed = even + np.concatenate([[0.0], np.cumsum(steps)]) / steps.sum()
-    return even[np.unique(np.searchsorted(passed, np.linspace(0, passed[-1], count)).clip(0, n_points - 1))]
+    chosen: Array = even[np.unique(np.searchsorted(passed, np.linspace(0, passed[-1], count)).clip(0, n_points - 1))]
+    return chosen
 
 
 def _rollouts(

@@ -116,7 +116,7 @@
     const some = motion.starts.drawn < motion.starts.of ? `${motion.starts.drawn} of ${motion.starts.of} motions are drawn. ` : "";
     find("drawn").textContent = (motion.dim > 1 && movers().length ? (solid ? "Drag to turn, scroll or pinch to zoom. " : "") : "") +
       "Bold: from the demonstrated start. Dashed: the demonstration. " + some +
-      gone.map((m) => `${labels[m]}: ${motion.methods[m].gone} leave the picture. `).join("");
+      gone.map((m) => `${labels[m]}: ${motion.methods[m].gone} of ${motion.starts.of} motions leave the picture. `).join("");
     tellTime();
   }
 
