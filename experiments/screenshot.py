@@ -24,7 +24,7 @@ METHODS = ("TubeDS", "Chebyshev", "FDM")
 def main(
     out: Annotated[Path, typer.Option(help="File to write, .png.")] = Path("docs/images/report.png"),
     width: Annotated[int, typer.Option(help="Of the window, in pixels.")] = 1400,
-    height: Annotated[int, typer.Option(help="Of the window, in pixels.")] = 1250,
+    height: Annotated[int, typer.Option(help="Of the window, in pixels.")] = 1430,
 ) -> None:
     """Compare on the made-up arm, and take a picture of the page."""
     with tempfile.TemporaryDirectory() as folder:
@@ -32,7 +32,7 @@ def main(
         cli.demo(recording)
         cli.compare([recording], list(METHODS), report=page)
         with browser(width, height) as window:
-            window.get(page.as_uri())
+            show(window, page)
             picture = window.get_screenshot_as_png()
     with atomic_write(out) as file:
         file.write(picture)
@@ -66,6 +66,15 @@ def browser(width: int, height: int) -> Iterator[Any]:
         yield window
     finally:
         window.quit()
+
+
+def show(window: Any, page: Path) -> None:
+    """Open a report, and wait until its pictures are on the screen."""
+    from selenium.webdriver.support.wait import WebDriverWait
+
+    window.get(page.as_uri())
+    WebDriverWait(window, 60).until(lambda _: window.execute_script("return 'drawn' in document.body.dataset"))
+    window.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
 
 
 if __name__ == "__main__":

@@ -548,13 +548,14 @@ def report(
     page = target(out, source, ".html", HTML)
     reading = Reading(columns, time, unit, dt)
     if is_system(source):
-        if method or seed:
+        if seed or any(":" not in text for text in method or ()):
             raise ValueError(f"method, seed: expected recordings to fit to, got a system: {source[0]}")
         reading.refuse(source[0])
-        ds, shown = loaded(source[0])
+        ds, shown = loaded(source[0], *(method or ()))
         if not shown:
             raise ValueError(NOT_FITTED)
-        rows, paths, told = compared([shown], {type(ds).__name__: partial(kept, ds)}, starts, radius, None, 1)
+        make = partial(kept, ds.double())
+        rows, paths, told = compared([shown], {type(ds).__name__: make}, starts, radius, None, 1)
         rows["fit_seconds"] = ds.fit_report.seconds if ds.fit_report else math.nan
     else:
         shown = reading(source)

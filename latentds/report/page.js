@@ -105,19 +105,20 @@
     const layout = { margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: motion.name + axes, showlegend: false, hovermode: "closest" };
     if (solid) {
       const axis = (k) => ({ ...quiet, title: title(k), showbackground: false, nticks: 5, showspikes: false });
-      layout.scene = { xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), aspectmode: motion.dim === 3 ? "data" : "cube", camera: { eye: { x: 1.35, y: -1.6, z: 0.9 }, center: { x: 0, y: 0, z: -0.12 } }, uirevision: motion.name };
+      layout.scene = { xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), aspectmode: motion.dim === 3 ? "data" : "cube", camera: { eye: { x: 1.6, y: -1.9, z: 1.05 }, center: { x: 0, y: 0, z: -0.12 } }, uirevision: motion.name };
     } else {
       layout.margin = { l: 10, r: 10, t: 10, b: 10 };
       layout.xaxis = { ...quiet, title: title(0), zeroline: false };
       layout.yaxis = { ...quiet, title: title(1), zeroline: false, ...(motion.dim === 2 ? { scaleanchor: "x" } : {}) };
     }
-    Plotly.react("replications", traces, layout, config);
+    const done = Plotly.react("replications", traces, layout, config);
     const gone = movers().filter((m) => motion.methods[m].gone);
     const some = motion.starts.drawn < motion.starts.of ? `${motion.starts.drawn} of ${motion.starts.of} motions are drawn. ` : "";
     find("drawn").textContent = (motion.dim > 1 && movers().length ? (solid ? "Drag to turn, scroll or pinch to zoom. " : "") : "") +
       "Bold: from the demonstrated start. Dashed: the demonstration. " + some +
       gone.map((m) => `${labels[m]}: ${motion.methods[m].gone} of ${motion.starts.of} motions leave the picture. `).join("");
     tellTime();
+    return done;
   }
 
   function tellTime() { find("clock").textContent = `${(moment * longest()).toFixed(2)} s`; }
@@ -171,7 +172,7 @@
     traces.push({ type: "scatter", mode: "markers", x: place, y: dots, xaxis: "x2", marker: { color: data.shown, size: 4, opacity: 0.4 }, hovertemplate: "%{y:.3g} %<extra>a start</extra>" });
     if (around.some((values) => values.length)) traces.push({ type: "scatter", mode: "markers", x: own.flatMap((values, i) => values.map(() => i)), y: own.flat(), xaxis: "x2", marker: { color: "white", size: 10, symbol: "diamond", line: { color: data.shown, width: 1.5 } }, hovertemplate: "%{y:.3g} %<extra>the demonstrated start</extra>" });
     const range = [-0.5, chosen.length - 0.5];
-    Plotly.react("distances", traces, {
+    return Plotly.react("distances", traces, {
       margin: { l: 10, r: 10, t: 10, b: 10 }, showlegend: false, bargap: 0.4,
       xaxis: { ...quiet, type: "category", range }, xaxis2: { overlaying: "x", range, visible: false, fixedrange: true },
       yaxis: { ...quiet, type: log ? "log" : "linear", title: { text: "distance [% of the size]" }, ...(log ? { tickvals: ticks(low, high), range: [Math.log10(low) - 0.3, Math.log10(high) + 0.15] } : { rangemode: "tozero" }) },
@@ -187,7 +188,7 @@
     for (const m of movers()) traces.push(ownLine(m, times, motion.methods[m].speed));
     // One wild fit is not to flatten all others: three times the largest demonstrated speed is seen.
     const limit = 3 * Math.max(...motion.shown_speed), top = Math.max(...traces.flatMap((trace) => trace.y));
-    Plotly.react("speeds", traces, {
+    return Plotly.react("speeds", traces, {
       margin: { l: 10, r: 10, t: 10, b: 10 }, showlegend: true, legend: { orientation: "h", y: 1.02, yanchor: "bottom" }, hovermode: "x unified",
       xaxis: { ...quiet, title: { text: "time [s]" }, zeroline: false }, yaxis: { ...quiet, title: { text: "speed [units / s]" }, range: [0, 1.05 * Math.min(top, limit)] },
     }, config);
@@ -205,7 +206,7 @@
       layout[`yaxis${id}`] = { ...quiet, zeroline: false, nticks: 5, title: { text: plain(motion.columns[k]) } };
     }
     layout.height = 60 + (count === 1 ? 300 : 150) * rows;
-    Plotly.react("joints", traces, layout, config);
+    return Plotly.react("joints", traces, layout, config);
   }
 
   function chooseAxes() {
@@ -223,7 +224,11 @@
     });
   }
 
-  function draw() { drawReplications(); drawDistances(); drawSpeeds(); drawJoints(); }
+  /** All pictures; the page says when they are there. */
+  function draw() {
+    delete document.body.dataset.drawn;
+    Promise.all([drawReplications(), drawDistances(), drawSpeeds(), drawJoints()]).then(() => { document.body.dataset.drawn = motion.name; });
+  }
 
   function choose(i) {
     play(false);
