@@ -511,8 +511,9 @@ def compare(
     """
     table = None if out is None else target(out, files, "", (".csv",))
     page = None if report is None else target(report, files, "", HTML)
+    methods = methods_of(method or known_methods())
     shown: list[Any] = Reading(columns, time, unit, dt)(files)
-    rows, paths, told = compared(shown, methods_of(method or known_methods()), starts, radius, seed, jobs)
+    rows, paths, told = compared(shown, methods, starts, radius, seed, jobs)
     tell_rows(rows, shown)
     if table is not None:
         with atomic_write(table) as file:
@@ -558,8 +559,9 @@ def report(
         rows, paths, told = compared([shown], {type(ds).__name__: make}, starts, radius, None, 1)
         rows["fit_seconds"] = ds.fit_report.seconds if ds.fit_report else math.nan
     else:
+        methods = methods_of(method or ["TubeDS"])
         shown = reading(source)
-        rows, paths, told = compared([shown], methods_of(method or ["TubeDS"]), starts, radius, seed, jobs)
+        rows, paths, told = compared([shown], methods, starts, radius, seed, jobs)
     write_report(page, rows, [shown], paths, told)
 
 

@@ -192,6 +192,7 @@ def test_a_method_that_was_not_tried_everywhere_is_no_winner(seven, tmp_path):
     assert page.data["motions"][1]["methods"][1] is None
 
 
+@pytest.mark.slow
 def test_certificates_are_shown_and_what_is_false_is_said(seven, tmp_path):
     ds = ChebyshevDS(7, n_layers=5).fit(seven)
     rows, _ = made_up([seven], ["Chebyshev"])
