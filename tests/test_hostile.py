@@ -190,6 +190,7 @@ def test_gradients_are_finite_far_away_and_at_the_attractor(ds):
         assert torch.isfinite(point.grad).all()
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_eight_threads_give_the_serial_result(ds, draw):
     batches = [torch.randn(n, 3, generator=draw, dtype=torch.float64) for n in (1, 7, 20) * 4]

@@ -175,6 +175,7 @@ def test_what_is_too_stiff_or_jumps_is_told(starts):
         assert paths[:, -1].isnan().all(), name
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_finite_differences(starts):
     times = TIMES[[0, 2, 9]]
     matrix = (TURNING / 4).requires_grad_()
@@ -194,6 +195,7 @@ def test_gradients_are_those_of_the_flow(starts):
     assert (found - torch.einsum("tij,bj->bti", flow, starts)).abs().max() < 1e-8
 
 
+@pytest.mark.slow
 def test_a_rejected_step_that_is_not_finite_spoils_no_gradient(starts):
     """ẏ = -r √y on a line; a step that is too long meets the root of a negative number."""
     rate = torch.ones(1, dtype=F64, requires_grad=True)

@@ -200,6 +200,7 @@ def test_a_state_that_makes_no_stable_system_does_not_load(name, value):
         moved.load_state_dict(moved.state_dict() | {f"similarity.{name}": value})
 
 
+@pytest.mark.slow
 def test_certified_where_the_motion_is_shown(fitted):
     here, moved = certify(fitted, n_samples=200), fitted.with_goal([50.0, 2.0]).transformed(scale=2.0)
     there = certify(moved, n_samples=200)
