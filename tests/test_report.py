@@ -367,6 +367,8 @@ def select(window, element, value):
 
 @pytest.mark.slow
 def test_in_a_browser_it_sorts_switches_turns_and_plays(window, page):
+    from selenium.webdriver.support.wait import WebDriverWait
+
     file, plane, arm = page
     show(window, file)
     assert window.title == "2 motions – latentds"
@@ -397,10 +399,11 @@ def test_in_a_browser_it_sorts_switches_turns_and_plays(window, page):
     ((x, y),) = traces(window, "replications", "TubeDS")
     np.testing.assert_allclose([x[-2], y[-2]], plane.at(plane.duration / 2) + 0.02, atol=0.01)
     window.find_element("id", "play").click()
-    assert window.find_element("id", "play").text == "Pause"
-    window.execute_async_script("setTimeout(arguments[0], 300)")
-    window.find_element("id", "play").click()
-    assert 500 < float(slider.get_property("value")) <= 1000
+    WebDriverWait(window, 30).until(lambda _: slider.get_property("value") != "500")
+    select(window, slider, 250)  # which stops it
+    assert window.find_element("id", "play").text == "Play"
+    window.execute_async_script("requestAnimationFrame(() => requestAnimationFrame(arguments[0]))")
+    assert window.find_element("id", "clock").text == f"{plane.duration / 4:.2f} s"
 
     select(window, window.find_element("id", "motion"), 1)
     chosen = window.find_elements("css selector", "#coordinates select")
@@ -423,7 +426,10 @@ def test_in_a_browser_it_is_as_wide_as_the_window(window, page, width):
 
 
 def check_quiet(window):
-    """Nothing went wrong, and nothing was asked for."""
+    """Nothing went wrong, nothing was asked for, and no picture hides what is beneath it."""
+    bottoms = "return [...document.querySelectorAll('.chart')].map((one) => one.querySelector('.svg-container')"
+    bottoms += ".getBoundingClientRect().bottom - one.getBoundingClientRect().bottom)"
+    assert max(window.execute_script(bottoms)) <= 1
     wrong = [told for told in window.get_log("browser") if told["level"] == "SEVERE"]
     assert not wrong
     asked = window.execute_script("return performance.getEntriesByType('resource').map((one) => one.name)")

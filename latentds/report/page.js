@@ -104,21 +104,22 @@
     const title = (k) => ({ text: motion.dim === 1 ? ["time [s]", plain(motion.columns[0])][k] : plain(motion.columns[axes[k]]) });
     const layout = { margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: motion.name + axes, showlegend: false, hovermode: "closest" };
     if (solid) {
+      const far = innerWidth < 600 ? 1.25 : 1; // room for the names of axes
       const axis = (k) => ({ ...quiet, title: title(k), showbackground: false, nticks: 5, showspikes: false });
-      layout.scene = { xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), aspectmode: motion.dim === 3 ? "data" : "cube", camera: { eye: { x: 1.6, y: -1.9, z: 1.05 }, center: { x: 0, y: 0, z: -0.12 } }, uirevision: motion.name };
+      layout.scene = { xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), aspectmode: motion.dim === 3 ? "data" : "cube", camera: { eye: { x: 1.6 * far, y: -1.9 * far, z: 1.05 * far }, center: { x: 0, y: 0, z: -0.12 } }, uirevision: motion.name };
     } else {
       layout.margin = { l: 10, r: 10, t: 10, b: 10 };
       layout.xaxis = { ...quiet, title: title(0), zeroline: false };
       layout.yaxis = { ...quiet, title: title(1), zeroline: false, ...(motion.dim === 2 ? { scaleanchor: "x" } : {}) };
     }
-    const done = Plotly.react("replications", traces, layout, config);
+    // Before the picture is drawn: it takes the height that this leaves.
     const gone = movers().filter((m) => motion.methods[m].gone);
     const some = motion.starts.drawn < motion.starts.of ? `${motion.starts.drawn} of ${motion.starts.of} motions are drawn. ` : "";
-    find("drawn").textContent = (motion.dim > 1 && movers().length ? (solid ? "Drag to turn, scroll or pinch to zoom. " : "") : "") +
+    find("drawn").textContent = (solid ? "Drag to turn, scroll or pinch to zoom. " : "") +
       "Bold: from the demonstrated start. Dashed: the demonstration. " + some +
       gone.map((m) => `${labels[m]}: ${motion.methods[m].gone} of ${motion.starts.of} motions leave the picture. `).join("");
     tellTime();
-    return done;
+    return Plotly.react("replications", traces, layout, config);
   }
 
   function tellTime() { find("clock").textContent = `${(moment * longest()).toFixed(2)} s`; }
