@@ -196,6 +196,7 @@ def test_compare_tells_writes_rows_and_a_page(folder):
     page = (folder / "all.html").read_text()
     assert "q_knee" in page
     assert "n_layers 30" in page
+    assert f"radius {0.05 * min(one.size for one in shown):.6g}" in page
     assert said.splitlines()[-2:] == ["wrote all.csv", "wrote all.html"]
 
 
@@ -225,13 +226,13 @@ def test_report_of_recordings_and_of_a_system(folder, system):
     assert "mine + again" in (folder / "mine.html").read_text()
     run("report", system, "--starts", 1)
     page = (folder / "wavy.html").read_text()
-    assert "TubeDS follows: wavy" in page
+    assert "TubeDS follows wavy: it stays" in page
     assert "proven" in page
     ds = latentds.load(system)
     assert f"{ds.fit_report.seconds:.2g}</td>" in page  # of the fit, long ago
     ds.float().save("single.safetensors")
     run("report", "single.safetensors", "--starts", 1)
-    assert "TubeDS follows: wavy" in (folder / "single.html").read_text()
+    assert "TubeDS follows wavy: it stays" in (folder / "single.html").read_text()
     run("fit", "mine.csv", "--method", "baselines:FDM,n_layers=9")
     run("report", "mine.safetensors", "--method", "baselines:FDM", "--starts", 1)
     assert "FDM" in (folder / "mine.html").read_text()

@@ -171,10 +171,12 @@ def test_the_verdict_says_whether_chance_may_make_the_difference(seven):
 
 def test_the_verdict_on_one_method_says_whether_it_follows_and_what_was_noted(seven):
     rows, _ = made_up([seven], ["TubeDS"])
-    assert report.verdict(Comparison(rows, seven))[0].startswith("TubeDS follows: arm 0, at a mean distance of 1 %")
+    assert report.verdict(Comparison(rows, seven))[0].startswith(
+        "TubeDS follows arm 0: it stays at a mean distance of 1 %"
+    )
     noted = rows.assign(follows=False, notes="it rests on the way; it jumps", converged=rows["start"] > 1)
     said = report.verdict(Comparison(noted, seven))
-    assert said[0].startswith("TubeDS does not follow as it should")
+    assert said[0].startswith("TubeDS does not follow arm 0 as it should: ")
     assert "Noted: it rests on the way; it jumps." in said
     assert "TubeDS: 2 of 5 motions do not arrive at the goal." in said
 
@@ -283,7 +285,12 @@ def test_it_shows_what_compare_found(tmp_path):
     rows = compare({"small": lambda dim: ChebyshevDS(dim, n_layers=5)}, shown, n_starts=2, n_jobs=1, paths=paths)
     page = Page(written(tmp_path, rows, shown, paths=paths, settings={"n_starts": 2}))
     assert set(paths) == {("small", one.name, 0) for one in shown}
-    assert page.row("small")[6] == f"{rows['converged'].sum()} of 6"
+    (line,) = Comparison(rows, shown).ranking()
+    shares = [report.percent(line[key]) for key in ("level", "spread", "worst", "own", "end")]
+    counts = ["{} of {}".format(*line[key]) for key in ("arrives", "follows")]
+    assert page.row("small")[1:] == [*shares, *counts, f"{line['seconds']:.2g}"]
+    assert line["arrives"] == (rows["converged"].sum(), 6)
+    assert page.row("hook")[1].startswith(report.percent(Comparison(rows, shown).by_motion()[0]["best"]))
     assert [motion["starts"] for motion in page.data["motions"]] == [{"drawn": 3, "of": 3}] * 2
     starts = positions(page.data["motions"][1]["methods"][0]["paths"], [3], 3, *(
         page.data["motions"][1][key] for key in ("low", "high")

@@ -123,14 +123,19 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]
     """Names and texts, a line each; the innermost mappings in one."""
     lines: list[tuple[str, str]] = []
     for key, value in settings.items():
-        name = f"{prefix}{key}"
         if isinstance(value, Mapping) and any(isinstance(inside, Mapping) for inside in value.values()):
-            lines += _flat(value, f"{name} · ")
-        elif isinstance(value, Mapping):
-            lines.append((name, ", ".join(f"{part} {inside}" for part, inside in value.items())))
+            lines += _flat(value, f"{prefix}{key} · ")
         else:
-            lines.append((name, ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)))
+            lines.append((f"{prefix}{key}", _told(value)))
     return lines
+
+
+def _told(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{part} {_told(inside)}" for part, inside in value.items())
+    if isinstance(value, (list, tuple)):
+        return ", ".join(map(_told, value))
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def _page(**told: Any) -> str:

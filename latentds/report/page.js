@@ -104,7 +104,7 @@
     const title = (k) => ({ text: motion.dim === 1 ? ["time [s]", plain(motion.columns[0])][k] : plain(motion.columns[axes[k]]) });
     const layout = { margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: motion.name + axes, showlegend: false, hovermode: "closest" };
     if (solid) {
-      const far = innerWidth < 600 ? 1.25 : 1; // room for the names of axes
+      const far = innerWidth < 600 ? 1.15 : 1; // room for the names of axes
       const axis = (k) => ({ ...quiet, title: title(k), showbackground: false, nticks: 5, showspikes: false });
       layout.scene = { xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), aspectmode: motion.dim === 3 ? "data" : "cube", camera: { eye: { x: 1.6 * far, y: -1.9 * far, z: 1.05 * far }, center: { x: 0, y: 0, z: -0.12 } }, uirevision: motion.name };
     } else {

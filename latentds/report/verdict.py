@@ -39,12 +39,11 @@ def _best(found: Comparison) -> str:
             f"{where}, before {others[0]['method']} with {percent(others[0]['level'])}"
             f"{_certainty(best, others[0], found)}."
         )
-    verb = "follows" if best["follows"][0] == best["follows"][1] else "does not follow as it should"
+    follows = best["follows"][0] == best["follows"][1]
+    said = f"{best['method']} follows {what}" if follows else f"{best['method']} does not follow {what} as it should"
     more = f", {percent(best['level'])} {where}" if count else ""
-    return (
-        f"{best['method']} {verb}: {what}, at a mean distance of {percent(best['own'])} of the motion's size "
-        f"from the demonstrated start{more}."
-    )
+    far = f"{percent(best['own'])} of the motion's size from the demonstrated start{more}"
+    return f"{said}: it stays at a mean distance of {far}."
 
 
 def _certainty(best: Mapping[str, Any], second: Mapping[str, Any], found: Comparison) -> str:
@@ -79,5 +78,7 @@ def _remarks(found: Comparison) -> Iterator[str]:
         followed, fits = line["follows"]
         if followed < fits and len(lines) > 1:
             yield f"{line['method']} does not follow in {fits - followed} of {fits} fits, by its own measurement."
-    for method, claim in sorted({(one["method"], claim) for one in found.certificates() for claim in one["false"]}):
-        yield f"{method}: falsified in its certificate: {claim}."
+    false = [(one["method"], claim) for one in found.certificates() for claim in one["false"]]
+    for method in dict.fromkeys(method for method, _ in false):
+        claims = dict.fromkeys(claim for one, claim in false if one == method)
+        yield f"{method}: falsified in its certificate: {'; '.join(claims)}."
