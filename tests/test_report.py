@@ -52,7 +52,7 @@ class Page(HTMLParser):
 
     def __init__(self, text):
         super().__init__()
-        self.tags, self.scripts, self.rows, self.open = [], [], [], ""
+        self.tags, self.scripts, self.rows, self.open, self.inside = [], [], [], "", False
         self.feed(text)
         kinds = [dict(attributes).get("type") for tag, attributes in self.tags if tag == "script"]
         self.data = json.loads(self.scripts[kinds.index("application/json")], parse_constant=pytest.fail)
@@ -64,16 +64,18 @@ class Page(HTMLParser):
             self.rows.append([])
         elif tag in ("td", "th"):
             self.rows[-1].append("")
+            self.inside = True
         elif tag == "script":
             self.scripts.append("")
 
     def handle_endtag(self, tag):
         self.open = ""
+        self.inside &= tag not in ("td", "th")
 
     def handle_data(self, text):
         if self.open == "script":
             self.scripts[-1] += text
-        elif self.rows and self.rows[-1]:
+        elif self.inside:
             self.rows[-1][-1] += text.strip()
 
     def row(self, first):
@@ -171,9 +173,8 @@ def test_the_verdict_says_whether_chance_may_make_the_difference(seven):
 
 def test_the_verdict_on_one_method_says_whether_it_follows_and_what_was_noted(seven):
     rows, _ = made_up([seven], ["TubeDS"])
-    assert report.verdict(Comparison(rows, seven))[0].startswith(
-        "TubeDS follows arm 0: it stays at a mean distance of 1 %"
-    )
+    (said,) = report.verdict(Comparison(rows, seven))
+    assert said.startswith("TubeDS follows arm 0: it stays at a mean distance of 1 %")
     noted = rows.assign(follows=False, notes="it rests on the way; it jumps", converged=rows["start"] > 1)
     said = report.verdict(Comparison(noted, seven))
     assert said[0].startswith("TubeDS does not follow arm 0 as it should: ")
