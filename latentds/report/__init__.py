@@ -56,7 +56,7 @@ def write(
             :func:`findings` gives it) is shown, too.
         demonstrations: those that were compared on, as ``compare`` takes them; they are the judges.
         paths: the rollouts, {(method, demonstration, seed): (B, T, n)}, as ``compare(…, paths=paths)`` fills them; of
-            several seeds the first is drawn. Without them the page has no motions but the demonstrated ones.
+            several seeds the lowest is drawn. Without them the page has no motions but the demonstrated ones.
         settings: what else to tell of how this was made, by name; versions, machine and date are added.
 
     Raises:
