@@ -21,7 +21,7 @@ from latentds.cell import COLUMNS
 from latentds.report.comparison import Comparison
 from latentds.testing import wavy_motion
 
-HOSTILE = "</script><img src=x onerror=\"document.title='lost'\"> & 'x' {{ 7 * 7 }}"
+HOSTILE = "</script><img src=x onerror=\"document.title='lost'\"> & 'x' {{ 7 * 7 }}" + 80 * "y"
 METHODS = "TubeDS", "FDM", "SDS-EF"
 
 

@@ -9,8 +9,8 @@
   const dashes = ["solid", "dash", "dot", "dashdot"];
   let motion, axes, moment = 1, playing = 0;
 
-  // Plotly reads a subset of HTML in its texts: names are to be seen as they are.
-  const plain = (text) => text.replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
+  // Plotly reads a subset of HTML in its texts: names are to be seen as they are, long ones shortened.
+  const plain = (text) => (text.length > 32 ? `${text.slice(0, 15)}…${text.slice(-15)}` : text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
   const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer;
   const floats = (text) => Array.from(new Float32Array(bytes(text)), (value) => (isNaN(value) ? null : value));
 
@@ -167,15 +167,14 @@
     const low = Math.min(...known), high = Math.max(...known), log = high > 20 * low;
     // On a log scale mean - sd may lie below zero: the whisker then ends at the smallest score.
     const down = spread.map((sd, i) => (log ? means[i] - Math.max(means[i] - sd, Math.min(means[i], ...judged[i].filter((value) => value !== null))) : Math.min(sd, means[i])));
-    traces.push({ type: "bar", x: names, y: means, marker: { color: chosen.map((m) => colors[m]), opacity: 0.8 }, error_y: { type: "data", array: spread, arrayminus: down, symmetric: false, color: data.shown, thickness: 1.4 }, hovertemplate: "%{x}: %{y:.3g} %<extra></extra>", width: 0.6 });
+    traces.push({ type: "bar", x: chosen.map((_, i) => i), y: means, hovertext: names, marker: { color: chosen.map((m) => colors[m]), opacity: 0.8 }, error_y: { type: "data", array: spread, arrayminus: down, symmetric: false, color: data.shown, thickness: 1.4 }, hovertemplate: "%{hovertext}: %{y:.3g} %<extra></extra>", width: 0.6 });
     const place = [], dots = [];
     around.forEach((values, i) => values.forEach((value, j) => { place.push(i + 0.4 * (values.length > 1 ? j / (values.length - 1) - 0.5 : 0)); dots.push(value); }));
-    traces.push({ type: "scatter", mode: "markers", x: place, y: dots, xaxis: "x2", marker: { color: data.shown, size: 4, opacity: 0.4 }, hovertemplate: "%{y:.3g} %<extra>a start</extra>" });
-    if (around.some((values) => values.length)) traces.push({ type: "scatter", mode: "markers", x: own.flatMap((values, i) => values.map(() => i)), y: own.flat(), xaxis: "x2", marker: { color: "white", size: 10, symbol: "diamond", line: { color: data.shown, width: 1.5 } }, hovertemplate: "%{y:.3g} %<extra>the demonstrated start</extra>" });
-    const range = [-0.5, chosen.length - 0.5];
+    traces.push({ type: "scatter", mode: "markers", x: place, y: dots, marker: { color: data.shown, size: 4, opacity: 0.4 }, hovertemplate: "%{y:.3g} %<extra>a start</extra>" });
+    if (around.some((values) => values.length)) traces.push({ type: "scatter", mode: "markers", x: own.flatMap((values, i) => values.map(() => i)), y: own.flat(), marker: { color: "white", size: 10, symbol: "diamond", line: { color: data.shown, width: 1.5 } }, hovertemplate: "%{y:.3g} %<extra>the demonstrated start</extra>" });
     return Plotly.react("distances", traces, {
       margin: { l: 10, r: 10, t: 10, b: 10 }, showlegend: false, bargap: 0.4,
-      xaxis: { ...quiet, type: "category", range }, xaxis2: { overlaying: "x", range, visible: false, fixedrange: true },
+      xaxis: { ...quiet, range: [-0.5, chosen.length - 0.5], tickvals: chosen.map((_, i) => i), ticktext: names, zeroline: false },
       yaxis: { ...quiet, type: log ? "log" : "linear", title: { text: "distance [% of the size]" }, ...(log ? { tickvals: ticks(low, high), range: [Math.log10(low) - 0.3, Math.log10(high) + 0.15] } : { rangemode: "tozero" }) },
     }, config);
   }
