@@ -171,6 +171,11 @@ def test_the_verdict_says_whether_chance_may_make_the_difference(seven):
         assert ("chance may make" in said) == (not sure)
 
 
+def test_a_tie_is_told(seven):
+    rows, _ = made_up([seven], METHODS[:2])
+    assert report.verdict(Comparison(rows, seven))[0].endswith("before FDM with 3.5 %, the same from every start.")
+
+
 def test_the_verdict_on_one_method_says_whether_it_follows_and_what_was_noted(seven):
     rows, _ = made_up([seven], ["TubeDS"])
     (said,) = report.verdict(Comparison(rows, seven))

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import numpy as np
 from scipy import stats
 
 from .comparison import Comparison
@@ -55,7 +56,9 @@ def _certainty(best: Mapping[str, Any], second: Mapping[str, Any], found: Compar
     if len(found.motions) > 1:
         return f", and nearer than that on {sum(one.level < other.level for one, other in known)} of {len(known)}"
     ((first, other),) = ((one.judged, other.judged) for one, other in known)
-    if len(first) < 3 or len(first) != len(other) or (first == other).all():
+    if np.array_equal(first, other):
+        return ", the same from every start"
+    if len(first) < 3 or len(first) != len(other):
         return ""
     p = float(stats.ttest_rel(first, other).pvalue)
     told = f"p = {p:.1g}, paired t-test over the {len(first)} starts"
