@@ -10,7 +10,7 @@ help: # What there is to make.
 	@grep -E '^[a-z -]+:.*# ' $(MAKEFILE_LIST) | sed -E 's/^([a-z -]+):[^#]*# (.*)/\1|\2/' | awk -F'|' '{printf "  make %-34s %s\n", $$1, $$2}'
 	@echo "Options go into ARGS: make compare ARGS=--quick"
 
-compare: .venv/installed # Ten spirals, every method: tables, rows and pictures in results/spirals.
+compare: .venv/installed # Ten spirals, every method: a report, tables, rows and pictures in results/spirals.
 	$(BIN)/python -m experiments.spirals $(ARGS)
 
 test: .venv/installed check # Linters, types and every test.

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import datetime
 import json
-import os
-import platform
 import subprocess
 from collections.abc import Sequence
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from latentds import report
 from latentds.files import atomic_write
-
-PACKAGES = ("latentds", "torch", "numpy", "scipy", "numba", "fastdtw", "pandas", "joblib")
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -25,15 +20,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 def environment() -> dict[str, Any]:
     """Versions, machine, date and, in a git checkout, revision."""
-    return {
-        "date": datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds"),
-        "revision": _revision(),
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "cpu": _cpu(),
-        "cores": os.cpu_count(),
-        "packages": {name: metadata.version(name) for name in PACKAGES},
-    }
+    return {"revision": _revision(), **report.environment()}
 
 
 def write(path: Path, content: str | dict[str, Any]) -> None:
@@ -49,11 +36,3 @@ def _revision() -> str | None:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return None
-
-
-def _cpu() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()

@@ -2,7 +2,7 @@
 
     python -m experiments.spirals [--quick] [--out results/spirals] [--jobs N] [--seeds 0 --seeds 1 …] [--dask tcp://…]
 
-Leaves rows.csv, summary.md, settings.json and pictures in ``--out``.
+Leaves rows.csv, summary.md, settings.json, pictures and report.html, all of it to look at, in ``--out``.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from experiments.methods import RIVALS, methods
 from experiments.motions import spirals
 from experiments.published import TABLE_ONE
 from latentds import Demonstration, plotting
+from latentds import report as page
 from latentds.benchmark import COLUMNS, Cell, Outcome, Protocol, run
 
 
@@ -45,7 +46,12 @@ def main(
     """
     began, console = time.perf_counter(), Console(width=None if sys.stdout.isatty() else 120)
     shown, seeds = spirals(quick), seeds or [0]
-    cells = [Cell(label, f, d, seed) for d in shown for label, f in methods(d.name, quick).items() for seed in seeds]
+    cells = [
+        Cell(label, f, d, seed, measure=page.findings)
+        for d in shown
+        for label, f in methods(d.name, quick).items()
+        for seed in seeds
+    ]
     done: list[Outcome] = []
     out.mkdir(parents=True, exist_ok=True)
     try:
@@ -55,7 +61,10 @@ def main(
     except KeyboardInterrupt:
         console.print(f"Interrupted: {len(done)} of {len(cells)} cells are done; the same command goes on from here.")
     if done:
-        rows = pd.DataFrame([row for outcome in done for row in outcome.rows], columns=list(COLUMNS))
+        order = {cell.name: i for i, cell in enumerate(cells)}
+        done.sort(key=lambda outcome: order[outcome.method, outcome.demonstration, outcome.seed])
+        every = pd.DataFrame([row for outcome in done for row in outcome.rows])
+        rows = every[list(COLUMNS)]
         seconds = time.perf_counter() - began
         settings = {
             "command": {"quick": quick, "jobs": jobs, "seeds": seeds, "seconds": round(seconds, 1)},
@@ -67,8 +76,10 @@ def main(
         report.write(out / "settings.json", settings | {"environment": report.environment()})
         report.write(out / "summary.md", summary)
         draw(rows, done, shown, out)
+        paths = {(outcome.method, outcome.demonstration, outcome.seed): outcome.paths for outcome in done}
+        page.write(out / "report.html", every, shown, paths=paths, settings=settings)
         console.print(Markdown(summary))
-        console.print(f"{out}: rows.csv, summary.md, settings.json and pictures, after {seconds:.0f} s")
+        console.print(f"{out}: report.html, rows.csv, summary.md, settings.json and pictures, after {seconds:.0f} s")
     if len(done) < len(cells):
         raise typer.Exit(130)
 

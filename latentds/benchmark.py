@@ -6,10 +6,12 @@ import importlib
 import os
 import warnings
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import nn
 
 from .arguments import whole_number
@@ -35,6 +37,7 @@ def compare(
     n_jobs: int | None = None,
     progress: bool = False,
     store: str | os.PathLike[str] | None = None,
+    paths: MutableMapping[tuple[str, str, int], NDArray[np.float64]] | None = None,
 ) -> pd.DataFrame:
     """Fit every method to every demonstration with every seed, roll each out from shared starts, and score it.
 
@@ -59,6 +62,8 @@ def compare(
             interrupted goes on where it stopped. A cell is known by its label, the method's settings and code, the
             demonstrations and judges, the seed and the protocol: if one changes, it is computed anew. Failed cells are
             not kept, nor are those of a method whose code or settings cannot be read; a warning names it.
+        paths: a mapping to put the rollouts into, {(method, demonstration, seed): (starts, n_points, n)}, for pictures
+            and for :func:`latentds.report.write`.
 
     Returns:
         One row per method, demonstration, seed and start:
@@ -94,7 +99,11 @@ def compare(
     _only_once("demonstrations", [cell.demonstration for cell in cells[:: len(methods) * len(seeds)]])
     outcomes = run(cells, Protocol(n_starts, radius, n_points), n_jobs=n_jobs, progress=progress, store=store)
     _try_out(cells)
-    rows = [row for outcome in outcomes for row in outcome.rows]
+    rows: list[dict[str, Any]] = []
+    for outcome in outcomes:
+        rows += outcome.rows
+        if paths is not None:
+            paths[outcome.method, outcome.demonstration, outcome.seed] = outcome.paths
     place = {key: i for i, key in enumerate(cell.name for cell in cells)}
     rows.sort(key=lambda row: (place[row["method"], row["demonstration"], row["seed"]], row["start"]))
     _warn_of_failures(rows)

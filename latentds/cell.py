@@ -123,12 +123,17 @@ class Cell:
     @property
     def demonstration(self) -> str:
         """The name of what is shown; of several, their names joined by " + ", each once."""
-        return " + ".join(dict.fromkeys(d.name for d in self.shown))
+        return joint_name(self.shown)
 
     @property
     def name(self) -> tuple[str, str, int]:
         """Method, demonstration and seed: what tells it from the other cells of a run."""
         return self.method, self.demonstration, self.seed
+
+
+def joint_name(shown: Sequence[Demonstration]) -> str:
+    """What rows call demonstrations that are fitted together."""
+    return " + ".join(dict.fromkeys(d.name for d in shown))
 
 
 @dataclass(frozen=True)

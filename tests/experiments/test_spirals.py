@@ -120,8 +120,15 @@ def test_the_command_leaves_rows_summary_settings_and_pictures(small, tmp_path):
     result = command("--out", tmp_path / "new")
     assert result.exit_code == 0, result.output
     found = {path.name for path in (tmp_path / "new").iterdir()}
-    pictures = {"unstable_c3.png", "unstable_c7.png", "stable_c2.png", "dtw_unstable.png", "dtw_stable.png"}
-    assert found == {"rows.csv", "summary.md", "settings.json", "cells.sqlite"} | pictures
+    pictures = {
+        "report.html",
+        "unstable_c3.png",
+        "unstable_c7.png",
+        "stable_c2.png",
+        "dtw_unstable.png",
+        "dtw_stable.png",
+    }
+    assert found == {"rows.csv", "summary.md", "settings.json", "report.html", "cells.sqlite"} | pictures
     rows = pd.read_csv(tmp_path / "new" / "rows.csv")
     assert len(rows) == 3 * 2 * 21
     assert "unstable c=7" in result.output
