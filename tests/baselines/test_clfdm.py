@@ -11,6 +11,8 @@ from baselines.clfdm import RATE, REACH, AsymmetricQuadratics
 from latentds import Demonstration
 from latentds.testing import parametrize_stable_ds, wavy_motion
 
+pytestmark = pytest.mark.slow  # fits and integrates for each clause; `make test` runs it
+
 METHODS = {"CLFDM": lambda dim: CLFDM(dim, n_components=2, n_asymmetric=1, iterations=10, seed=0)}
 
 

@@ -10,6 +10,8 @@ from baselines.cloning import BehaviourCloning
 from latentds import Demonstration
 from latentds.testing import parametrize_stable_ds, wavy_motion
 
+pytestmark = pytest.mark.slow  # fits and integrates for each clause; `make test` runs it
+
 PROMISES_NOTHING = {
     "check_equilibrium": "a regression of velocities has no equilibrium at the goal",
     "check_descent": "no function is made to fall",

@@ -12,6 +12,8 @@ from latentds.dynamics import Frame
 from latentds.metrics import dtw
 from latentds.testing import parametrize_stable_ds, wavy_motion
 
+pytestmark = pytest.mark.slow  # fits and integrates for each clause; `make test` runs it
+
 
 def small(dim, **settings):
     return NCDS(dim, **{"n_layers": 4, "n_features": 20, "n_units": 8, "seed": 0, "epochs": 40, **settings})

@@ -13,6 +13,8 @@ from baselines.lpvds import LPVDS, RATE, LinearSystems
 from latentds import Demonstration, datasets
 from latentds.testing import parametrize_stable_ds, wavy_motion
 
+pytestmark = pytest.mark.slow  # fits and integrates for each clause; `make test` runs it
+
 pytest.importorskip("cvxpy")
 
 

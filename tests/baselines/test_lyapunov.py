@@ -10,6 +10,8 @@ import latentds
 from baselines.lyapunov import Bowl, NeuralLyapunov
 from latentds.testing import parametrize_stable_ds, wavy_motion
 
+pytestmark = pytest.mark.slow  # fits and integrates for each clause; `make test` runs it
+
 
 def small(dim, **settings):
     return NeuralLyapunov(dim, **{"n_units": 24, "n_convex": 12, "alpha": 1.0, "seed": 0, "epochs": 40, **settings})

@@ -13,6 +13,8 @@ from baselines.promp import DOUBT
 from latentds import Demonstration, datasets
 from latentds.testing import parametrize_stable_ds, wavy_motion
 
+pytestmark = pytest.mark.slow  # fits and integrates for each clause; `make test` runs it
+
 METHODS = {"DMP": lambda dim: DMP(dim, n_basis=30), "ProMP": lambda dim: ProMP(dim, n_basis=20)}
 
 NO_FIELD = {

@@ -11,6 +11,8 @@ from baselines.seds import SLOWEST
 from latentds import Demonstration, datasets
 from latentds.testing import parametrize_stable_ds, wavy_motion
 
+pytestmark = pytest.mark.slow  # fits and integrates for each clause; `make test` runs it
+
 METHODS = {"SEDS": lambda dim: SEDS(dim, n_components=2, iterations=10, seed=0)}
 
 
