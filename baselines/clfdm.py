@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor, nn
 
 from latentds.arguments import whole_number
-from latentds.base import FitReport, StableDS
-from latentds.demonstration import Demonstration, demonstrations_of
 
 from .mixture import MixtureRegression, drawn_seed, fit_regression, nearby
+from .networks import NormalizedDS
 from .pooling import Pool
-from .training import descend_smoothly
+from .training import Training, descend_smoothly
 
 RATE = 1.0
 """α: V falls at least by α V a duration, so that whatever the regression says a motion is within a hundredth of its way
@@ -30,7 +26,7 @@ REWARD = 1e-4
 """Weight of descending steeply beside that of not rising, as in the authors' code."""
 
 
-class CLFDM(StableDS):
+class CLFDM(NormalizedDS):
     """Control Lyapunov function-based dynamic movements: ẏ = f(y) + u(y), u as small as makes V fall (2014).
 
     V is a weighted sum of asymmetric quadratic functions, learned from the directions of the demonstrated velocities
@@ -53,12 +49,9 @@ class CLFDM(StableDS):
         seed: of the mixture's k-means; None draws it from torch's generator.
 
     Attributes:
-        size, duration: () buffers: the units of length and of time in which V and f are written.
         pace: () buffer, the largest demonstrated speed in these units.
     """
 
-    size: Tensor
-    duration: Tensor
     pace: Tensor
 
     def __init__(
@@ -70,23 +63,19 @@ class CLFDM(StableDS):
         iterations: int = 300,
         seed: int | None = None,
     ) -> None:
-        super().__init__(dim)
+        super().__init__(dim, seed=seed)
         self.n_components = None if n_components is None else whole_number(n_components, "n_components", at_least=1)
         self.n_asymmetric = whole_number(n_asymmetric, "n_asymmetric", at_least=0)
         self.iterations = whole_number(iterations, "iterations", at_least=1)
-        self.seed = None if seed is None else whole_number(seed, "seed", at_least=0)
-        self.register_buffer("size", torch.ones((), dtype=torch.float64))
-        self.register_buffer("duration", torch.ones((), dtype=torch.float64))
         self.register_buffer("pace", torch.ones((), dtype=torch.float64))
         self.energy = AsymmetricQuadratics(self.dim, self.n_asymmetric)
         self.regression = MixtureRegression(self.dim)
 
-    def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> CLFDM:
-        shown = demonstrations_of(demonstration, self.dim)
-        began = time.perf_counter()
-        pool = Pool.of(shown)
+    def _train(self, pool: Pool, progress: bool) -> tuple[CLFDM, Training]:
+        learner = CLFDM(**self.settings)
+        energy = learner.energy
         regression = fit_regression(pool, self.n_components, drawn_seed(self.seed))
-        energy = AsymmetricQuadratics(self.dim, self.n_asymmetric)
+        learner.regression.load_state_dict(regression.state_dict())
         speeds, distances = (torch.linalg.vector_norm(part, dim=-1) for part in (pool.velocities, pool.points))
         moving = (speeds > 1e-3 * speeds.max()) & (distances > REACH)
         points, headings = pool.points[moving], pool.velocities[moving] / speeds[moving, None]
@@ -103,39 +92,24 @@ class CLFDM(StableDS):
 
         history = descend_smoothly(loss, dict.fromkeys(energy.parameters(), 1.0), self.iterations)
         with torch.no_grad():
+            learner.pace.copy_(speeds.max())
             share = float((rises() > 0).double().mean())
-            self.energy.load_state_dict(energy.state_dict())
-            self.regression.load_state_dict(regression.state_dict())
-            self.attractor.copy_(pool.goal)
-            for name in ("size", "duration"):
-                self.get_buffer(name).copy_(getattr(pool, name))
-            self.pace.copy_(speeds.max())
-            missed = self._velocity(pool.points.to(self.attractor)) - pool.velocities.to(self.attractor)
-            mse = float(missed.square().mean() * (pool.size / pool.duration) ** 2)
         notes = (f"V rises along {share:.1%} of the demonstrated samples, where it bends the motion",) if share else ()
-        seconds, origins = time.perf_counter() - began, tuple(d.fingerprint for d in shown)
-        self.fit_report = FitReport(mse, regression.mixture.n_components, seconds, history, notes, origins)
-        return self
-
-    def forward(self, y: Tensor) -> Tensor:
-        points, wanted = self._points(y)
-        velocity = self._velocity((points - self.attractor) / self.size)
-        return (velocity * (self.size / self.duration)).to(wanted)
+        return learner, Training(history, notes, regression.mixture.n_components)
 
     def lyapunov(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
-        energy: Tensor = self.energy((points - self.attractor) / self.size)
+        energy: Tensor = self.energy(self._normalize(points))
         return energy.to(wanted)
 
-    def _velocity(self, z: Tensor) -> Tensor:
-        """In sizes per duration at z, in sizes from the goal: (..., n) -> (..., n)."""
-        fading = -torch.expm1(-z.square().sum(-1, keepdim=True) / (2 * REACH**2))
-        wish = fading * self.regression(z, nearby(z))
+    def normalized_velocity(self, u: Tensor) -> Tensor:
+        fading = -torch.expm1(-u.square().sum(-1, keepdim=True) / (2 * REACH**2))
+        wish = fading * self.regression(u, nearby(u))
         speed = torch.linalg.vector_norm(wish, dim=-1, keepdim=True)
         wish = wish / (1 + (speed / (HASTE * self.pace)) ** 8) ** 0.125
-        slope = self.energy.gradient(z)
-        excess = (slope * wish).sum(-1) + RATE * self.energy(z)
-        steep = slope.square().sum(-1).clamp(min=torch.finfo(z.dtype).tiny)
+        slope = self.energy.gradient(u)
+        excess = (slope * wish).sum(-1) + RATE * self.energy(u)
+        steep = slope.square().sum(-1).clamp(min=torch.finfo(u.dtype).tiny)
         velocity: Tensor = wish - (excess.clamp(min=0) / steep).unsqueeze(-1) * slope
         return velocity
 

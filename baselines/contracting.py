@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 
 from latentds.arguments import number_in, whole_number
-from latentds.base import FitReport, LatentDS
-from latentds.demonstration import Demonstration, demonstrations_of
-from latentds.dynamics import Frame, LatentDynamics
+from latentds.dynamics import Frame
 from latentds.integrate import integrate
 
 from .couplings import AffineCouplings, no_autocast
+from .flows import FlowDS, FlowDynamics, Normalized, descend_bending, ray_loss
 from .networks import seeded_generator
-from .sdsef import Normalized, descend_bending, ray_loss
-from .training import Plan
+from .training import Plan, Training
 
 
-class NCDS(LatentDS):
+class NCDS(FlowDS):
     """ẋ has the Jacobian -(JᵀJ + εI) + S in the space of a learned flow (after Beik-Mohammadi et al. 2024).
 
     φ = ψ⁻¹ is a chain of affine couplings and the latent field :class:`ContractingDynamics`; both are learned together
@@ -70,37 +67,19 @@ class NCDS(LatentDS):
         self.seed = self_seed
         self.epochs = whole_number(epochs, "epochs", at_least=1)
 
-    def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> NCDS:
-        shown = demonstrations_of(demonstration, self.dim)
-        began = time.perf_counter()
-        # A fresh system is trained, in float32 and in normalised units, and an interrupted fit leaves self alone.
-        learner = NCDS(**self.settings).to(self.attractor.device, torch.float32)
-        data = Normalized.of(shown)
+    def _train(self, data: Normalized, generator: torch.Generator | None, progress: bool) -> Training:
         plan = Plan(self.epochs, learning_rate=2e-3, n_batches=4, warm_up=0.05, clip=1.0, slack=0.3)
 
         def pull(u: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-            return learner.dynamics.pull(z), torch.ones_like(z[:, :1])
+            return self.dynamics.pull(z), torch.ones_like(z[:, :1])
 
         def loss_of(bent: Normalized) -> Callable[[Tensor], Tensor]:
-            return ray_loss(learner.diffeomorphism, pull, bent)
+            return ray_loss(self.diffeomorphism, pull, bent)
 
-        training = descend_bending(loss_of, learner, data, plan, seeded_generator(self.seed), progress)
-        self.load_state_dict(learner.state_dict())
-        with torch.no_grad():
-            self.diffeomorphism.center.copy_(data.center)
-            self.diffeomorphism.scale.copy_(data.scale)
-            self.dynamics.duration.fill_(data.duration)
-            self.attractor.copy_(torch.stack([d.goal for d in shown]).mean(0))
-            starts = torch.stack([d.start for d in shown]).to(self.attractor)
-            self.start.copy_(starts[self.lyapunov(starts).argmax()])  # the farthest in latent space
-            missed = [self(d.positions.to(self.attractor)) - d.velocities.to(self.attractor) for d in shown]
-            mse = float(torch.cat(missed).square().mean())
-        seconds, origins = time.perf_counter() - began, tuple(d.fingerprint for d in shown)
-        self.fit_report = FitReport(mse, self.n_layers, seconds, training.history, training.notes, origins)
-        return self
+        return descend_bending(self, loss_of, data, plan, generator, progress)
 
 
-class ContractingDynamics(LatentDynamics):
+class ContractingDynamics(FlowDynamics):
     """ẋ = -Wᵀ(tanh(Wz + b) - tanh(b)) - εz + Sz, z = x - x*, S skew, in units of the duration.
 
     Its Jacobian is -(JᵀJ + εI) + S with J = diag(√(1 - tanh²(Wz + b))) W, so ‖x - z‖ of any two motions falls at least
@@ -111,12 +90,7 @@ class ContractingDynamics(LatentDynamics):
         n_units: M >= 1, rows of W.
         rate: ε > 0, per duration.
         generator: draws W and b (torch's global one if None).
-
-    Attributes:
-        duration: () buffer, seconds in one unit of time.
     """
-
-    duration: Tensor
 
     def __init__(self, dim: int, n_units: int, rate: float, *, generator: torch.Generator | None = None) -> None:
         super().__init__()
@@ -126,7 +100,6 @@ class ContractingDynamics(LatentDynamics):
         self.weight = nn.Parameter(drawn[:, :-1] * (2 / self.n_units) ** 0.5)
         self.bias = nn.Parameter(drawn[:, -1] * 0.5)
         self.turning = nn.Parameter(torch.zeros(dim, dim, dtype=torch.float64))
-        self.register_buffer("duration", torch.ones((), dtype=torch.float64))
 
     def forward(self, x: Tensor, y: Tensor, frame: Frame) -> Tensor:
         return self.pull(x - frame.attractor) / self.duration

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from functools import lru_cache
 
@@ -13,9 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from latentds.arguments import whole_number
+from latentds.base import Learned
 from latentds.demonstration import Demonstration
 
-from .phase import PhaseDriven, shown_apart
+from .phase import PhaseDriven, refuse_closed
 
 Array = NDArray[np.float64]
 
@@ -65,9 +65,8 @@ class DMP(PhaseDriven):
         self.register_buffer("departure", torch.zeros(self.dim, dtype=torch.float64))
         self.register_buffer("responses", torch.from_numpy(responses(self.n_basis)).clone(), persistent=False)
 
-    def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> DMP:
-        shown = shown_apart(demonstration, self.dim)
-        began = time.perf_counter()
+    def _learn(self, shown: Sequence[Demonstration], progress: bool) -> Learned:
+        refuse_closed(shown)
         fresh = DMP(self.dim, n_basis=self.n_basis)
         fresh._place(shown)
         with torch.no_grad():
@@ -81,8 +80,7 @@ class DMP(PhaseDriven):
             wanted = torch.cat([wanted, wanted.new_zeros(self.n_basis, self.dim)])
             fresh.weights.copy_(torch.linalg.lstsq(bent, wanted, driver="gelsd").solution / lengths[:, None])
             self.load_state_dict(fresh.state_dict())
-        self._tell(shown, self.n_basis, time.perf_counter() - began)
-        return self
+        return self._learned(shown, self.n_basis)
 
     def motion(self, y: Tensor, since: float, s: Tensor, *, at_rest: bool = False) -> Tensor:
         moved, _ = self._reference(s)

@@ -15,7 +15,7 @@ from latentds.arguments import whole_number
 
 from .couplings import no_autocast
 from .mixture import GaussianMixture, drawn_seed, make_room, resize, scikit_learn
-from .networks import NormalizedDS
+from .networks import NormalizedDS, thinned
 from .pooling import Pool
 from .training import Training
 
@@ -63,8 +63,8 @@ class LPVDS(NormalizedDS):
         self.mixture = GaussianMixture(self.dim)
         self.systems = LinearSystems(self.dim)
 
-    def learn(self, pool: Pool, progress: bool) -> tuple[LPVDS, Training]:
-        learner = LPVDS(**self.settings)
+    def _train(self, pool: Pool, progress: bool) -> tuple[LPVDS, Training]:
+        learner, pool = LPVDS(**self.settings), thinned(pool)
         points, velocities = pool.points.numpy(), pool.velocities.numpy()
         weights, means, covariances = _clustered(points, velocities, self.n_components, drawn_seed(self.seed))
         learner.mixture.assign(weights, means, covariances)

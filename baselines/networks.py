@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
@@ -13,8 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from latentds.arguments import whole_number
-from latentds.base import FitReport, StableDS
-from latentds.demonstration import Demonstration, demonstrations_of
+from latentds.base import Learned, StableDS
+from latentds.demonstration import Demonstration
 
 from .couplings import no_autocast
 from .pooling import Pool
@@ -52,28 +51,24 @@ class NormalizedDS(StableDS):
         self.register_buffer("duration", torch.ones((), dtype=torch.float64))
 
     @abstractmethod
-    def learn(self: Normal, pool: Pool, progress: bool) -> tuple[Normal, Training]:
+    def _train(self: Normal, pool: Pool, progress: bool) -> tuple[Normal, Training]:
         """A new system of the same settings, on whatever device and in whatever dtype, whose f has learned."""
 
     @abstractmethod
     def normalized_velocity(self, u: Tensor) -> Tensor:
         """f: (..., n) -> (..., n)."""
 
-    def fit(self: Normal, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> Normal:
-        shown = demonstrations_of(demonstration, self.dim)
-        began = time.perf_counter()
-        pool = thinned(Pool.of(shown))
-        learner, training = self.learn(pool, progress)  # an interrupted fit leaves self alone
+    def _learn(self, shown: Sequence[Demonstration], progress: bool) -> Learned:
+        pool = Pool.of(shown)
+        learner, training = self._train(pool, progress)
         self.load_state_dict(learner.state_dict())
         with torch.no_grad():
             self.attractor.copy_(pool.goal)
             self.size.copy_(pool.size)
             self.duration.copy_(pool.duration)
             missed = [self(d.positions.to(self.attractor)) - d.velocities.to(self.attractor) for d in shown]
-            mse = float(torch.cat(missed).square().mean())
-        seconds, origins = time.perf_counter() - began, tuple(d.fingerprint for d in shown)
-        self.fit_report = FitReport(mse, 0, seconds, training.history, training.notes, origins)
-        return self
+        mse = float(torch.cat(missed).square().mean())
+        return Learned(mse, training.n_parts, training.history, training.notes)
 
     def forward(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
@@ -98,7 +93,8 @@ class VelocityRegression(NormalizedDS):
         super().__init__(dim, seed=seed)
         self.epochs = whole_number(epochs, "epochs", at_least=1)
 
-    def learn(self: Regressing, pool: Pool, progress: bool) -> tuple[Regressing, Training]:
+    def _train(self: Regressing, pool: Pool, progress: bool) -> tuple[Regressing, Training]:
+        pool = thinned(pool)
         learner = type(self)(**self.settings).to(self.attractor.device, torch.float32)
         points, velocities = pool.points.to(learner.attractor), pool.velocities.to(learner.attractor)
         typical = velocities.square().sum(-1).mean()

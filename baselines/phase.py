@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from latentds.arguments import number_in
-from latentds.base import FitReport, StableDS
-from latentds.demonstration import Demonstration, demonstrations_of, goal_apart
+from latentds.base import Learned, StableDS
+from latentds.demonstration import Demonstration, goal_apart
 
 NODES = 1000
 """Of the path on which a point's phase is looked up."""
@@ -69,11 +69,11 @@ class PhaseDriven(StableDS):
         points, wanted = self._points(y, "y")
         phase = number_in(since, "since", 0, float("inf"), ends="[)") / float(self.duration)
         path = self.motion(points, phase, phase + self._times(t) / self.duration, at_rest=at_rest)
-        return self._begun_at(y, path.to(wanted))
+        return self._with_exact_start(y, path.to(wanted))
 
     def rollout(self, y0: Tensor, t: Tensor) -> Tensor:
         points, wanted = self._points(y0, "y0")
-        return self._begun_at(y0, self.motion(points, 0.0, self._times(t) / self.duration).to(wanted))
+        return self._with_exact_start(y0, self.motion(points, 0.0, self._times(t) / self.duration).to(wanted))
 
     def forward(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
@@ -108,19 +108,16 @@ class PhaseDriven(StableDS):
         self.duration.fill_(sum(d.duration for d in shown) / len(shown))
 
     @torch.no_grad()
-    def _tell(self, shown: Sequence[Demonstration], n_layers: int, seconds: float) -> None:
-        """The report: the mean squared error, per coordinate, of the motions from the demonstrated starts."""
+    def _learned(self, shown: Sequence[Demonstration], n_layers: int) -> Learned:
+        """What was learned, with the mean squared error per coordinate of the motions from the demonstrated starts."""
         missed = [
             self.motion(d.start.to(self.attractor), 0.0, (d.times / d.duration).to(self.attractor)).cpu() - d.positions
             for d in shown
         ]
-        mse, origins = float(torch.cat(missed).square().mean()), tuple(d.fingerprint for d in shown)
-        self.fit_report = FitReport(mse, n_layers, seconds, learned_from=origins)
+        return Learned(float(torch.cat(missed).square().mean()), n_layers)
 
 
-def shown_apart(demonstration: Demonstration | Sequence[Demonstration], dim: int) -> list[Demonstration]:
-    """What ``fit`` is given, whose ends are apart."""
-    shown = demonstrations_of(demonstration, dim)
+def refuse_closed(shown: Sequence[Demonstration]) -> None:
+    """That each demonstration's own ends are apart."""
     for d in shown:
         goal_apart(d, d.goal)
-    return shown

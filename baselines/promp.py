@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
 from latentds.arguments import whole_number
+from latentds.base import Learned
 from latentds.demonstration import Demonstration
 
 from .mixture import make_room, resize
-from .phase import PhaseDriven, shown_apart
+from .phase import PhaseDriven, refuse_closed
 
 DOUBT = 0.01
 """Standard deviation of a weight that no demonstration tells of, in sizes: all there is with a single one."""
@@ -54,17 +54,15 @@ class ProMP(PhaseDriven):
         self.deviations = nn.Parameter(torch.zeros(1, self.n_basis, self.dim, dtype=torch.float64))
         self.register_buffer("doubt", torch.tensor(DOUBT, dtype=torch.float64))
 
-    def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> ProMP:
-        shown = shown_apart(demonstration, self.dim)
-        began = time.perf_counter()
+    def _learn(self, shown: Sequence[Demonstration], progress: bool) -> Learned:
+        refuse_closed(shown)
         weights = torch.stack([self._weights(d) for d in shown])
         mean = weights.mean(0)
         resize(self, {"mean": mean, "deviations": (weights - mean) / len(shown) ** 0.5})
         with torch.no_grad():
             self.doubt.fill_(DOUBT * max(d.size for d in shown))
             self._place(shown)
-        self._tell(shown, self.n_basis, time.perf_counter() - began)
-        return self
+        return self._learned(shown, self.n_basis)
 
     def _weights(self, shown: Demonstration) -> Tensor:
         values, _ = basis(self.n_basis, shown.times / shown.duration)

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor, nn
 
 from latentds.arguments import whole_number
-from latentds.base import FitReport, StableDS
-from latentds.demonstration import Demonstration, demonstrations_of
 
 from .mixture import GaussianMixture, drawn_seed, fit_regression, make_room, nearby, resize
+from .networks import NormalizedDS
 from .pooling import Pool
-from .training import descend_smoothly
+from .training import Training, descend_smoothly
 
 SLOWEST = 0.05
 """Least rate at which every linear system approaches the goal, in 1 / duration: the margin of a strict inequality."""
@@ -30,7 +26,7 @@ PRIOR = 1e-3
 four demonstrations it lowers the error at the other three, which a mixture that is free to shrink does not know."""
 
 
-class SEDS(StableDS):
+class SEDS(NormalizedDS):
     """Stable estimator of dynamical systems: ẏ = Σ_k γ_k(y) A_k (y - y*), A_k + A_kᵀ < 0 (Khansari-Zadeh 2011).
 
     γ are the responsibilities of a Gaussian mixture over positions, and V(y) = ‖y - y*‖² falls along every motion, so
@@ -49,41 +45,28 @@ class SEDS(StableDS):
             positions and velocities chooses.
         iterations: of L-BFGS at most, each time, >= 1.
         seed: of the mixture's k-means; None draws it from torch's generator.
-
-    Attributes:
-        size, duration: () buffers: the units of length and of time in which ``systems`` are written.
     """
-
-    size: Tensor
-    duration: Tensor
 
     def __init__(
         self, dim: int, *, n_components: int | None = None, iterations: int = 200, seed: int | None = None
     ) -> None:
-        super().__init__(dim)
+        super().__init__(dim, seed=seed)
         self.n_components = None if n_components is None else whole_number(n_components, "n_components", at_least=1)
         self.iterations = whole_number(iterations, "iterations", at_least=1)
-        self.seed = None if seed is None else whole_number(seed, "seed", at_least=0)
-        self.register_buffer("size", torch.ones((), dtype=torch.float64))
-        self.register_buffer("duration", torch.ones((), dtype=torch.float64))
         self.systems = StableSystems(self.dim)
 
-    def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> SEDS:
-        shown = demonstrations_of(demonstration, self.dim)
-        began = time.perf_counter()
-        pool, learner = Pool.of(shown), StableSystems(self.dim)
-        learner.assign(fit_regression(pool, self.n_components, drawn_seed(self.seed)).mixture)
-
-        steps = {learner.get_parameter(name): step for name, step in STEPS.items()}
-        before = {parameter: parameter.detach().clone() for parameter in learner.mixture.parameters()}
+    def _train(self, pool: Pool, progress: bool) -> tuple[SEDS, Training]:
+        learner = SEDS(**self.settings)
+        systems = learner.systems
+        systems.assign(fit_regression(pool, self.n_components, drawn_seed(self.seed)).mixture)
+        steps = {systems.get_parameter(name): step for name, step in STEPS.items()}
+        before = {parameter: parameter.detach().clone() for parameter in systems.mixture.parameters()}
         unit = pool.velocities.square().mean()
 
-        def error() -> Tensor:
-            missed: Tensor = learner(pool.points) - pool.velocities
-            return missed.square().mean() / unit
-
         def plain_loss() -> Tensor:
-            return error() + LEAN * (learner.slopes() + PACE * torch.eye(self.dim).double()).square().sum()
+            error: Tensor = (systems(pool.points) - pool.velocities).square().mean() / unit
+            lean: Tensor = (systems.slopes() + PACE * torch.eye(self.dim).double()).square().sum()
+            return error + LEAN * lean
 
         def loss() -> Tensor:
             return plain_loss() + PRIOR * sum(((p - known) / steps[p]).square().sum() for p, known in before.items())
@@ -92,20 +75,11 @@ class SEDS(StableDS):
             plain_loss, {p: step for p, step in steps.items() if p not in before}, self.iterations
         )
         history += descend_smoothly(loss, steps, self.iterations)
-        self.systems.load_state_dict(learner.state_dict())
-        with torch.no_grad():
-            for name in ("size", "duration"):
-                self.get_buffer(name).copy_(getattr(pool, name))
-            self.attractor.copy_(pool.goal)
-            mse = float(error() * unit * (pool.size / pool.duration) ** 2)
-        seconds, origins = time.perf_counter() - began, tuple(d.fingerprint for d in shown)
-        self.fit_report = FitReport(mse, learner.mixture.n_components, seconds, history, (), origins)
-        return self
+        return learner, Training(history, (), systems.mixture.n_components)
 
-    def forward(self, y: Tensor) -> Tensor:
-        points, wanted = self._points(y)
-        velocity: Tensor = self.systems((points - self.attractor) / self.size) * (self.size / self.duration)
-        return velocity.to(wanted)
+    def normalized_velocity(self, u: Tensor) -> Tensor:
+        velocity: Tensor = self.systems(u)
+        return velocity
 
     def lyapunov(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)

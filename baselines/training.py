@@ -59,6 +59,8 @@ class Training(NamedTuple):
     history: tuple[float, ...]
     """Mean loss over the batches of each epoch; epochs that diverged are left out."""
     notes: tuple[str, ...]
+    n_parts: int = 0
+    """What the report tells as ``n_layers``: components of a mixture."""
 
 
 def descend(

@@ -1,7 +1,7 @@
 """latentds: globally stable motions from one demonstration."""
 
 from . import datasets
-from .base import FitReport, LatentDS, StableDS
+from .base import FitReport, LatentDS, Learned, StableDS
 from .benchmark import compare
 from .certificate import Certificate, certify
 from .demonstration import Demonstration
@@ -22,6 +22,7 @@ __all__ = [
     "FitReport",
     "FitWarning",
     "LatentDS",
+    "Learned",
     "LocallyWeightedTranslations",
     "StableDS",
     "TubeDS",

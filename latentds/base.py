@@ -8,13 +8,13 @@ import inspect
 import json
 import math
 import os
+import time
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from contextvars import ContextVar
-from dataclasses import asdict, dataclass, replace
-from functools import wraps
-from typing import Any, ClassVar, TypeVar
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, ClassVar, TypeVar, final
 
 import torch
 from torch import Tensor, nn
@@ -25,14 +25,14 @@ from .deploy.controller import Controller
 from .deploy.tables import FieldTables, field_tables
 from .diffeomorphism import Diffeomorphism, eager_for_derivatives
 from .dynamics import Frame, LatentDynamics
-from .fidelity import Excerpt, Fidelity, FitWarning, measure
+from .fidelity import POINTS, ROUNDING, Excerpt, Fidelity, FitWarning, measure, restart_gap
 from .files import write_tensors
 from .integrate import integrate
 from .kernels.dispatch import no_active_transforms
 from .memory import Memo, tensors_of
 from .wrappers import Similarity, check_rotation
 
-FORMAT = 3
+FORMAT = 4
 """Of the files of systems; raised when they change so that another latentds would misread them."""
 
 Self = TypeVar("Self", bound="StableDS")
@@ -51,9 +51,9 @@ class FitReport:
         notes: what the user should know of this fit (early stop, divergence handled, choices made, what does not
             follow the demonstration).
         learned_from: name and SHA-256 of each demonstration.
-        fidelity: how the fitted system follows what it was shown, measured after every fit, whatever the method.
-        columns: names of the coordinates, from the demonstrations; () if they have none. Filled in by the system.
-        state: SHA-256 of the system's state after the fit, to the precision of float32; filled in by the system.
+        fidelity: how the fitted system follows what it was shown; None if a motion of it raised an error.
+        columns: names of the coordinates, from the demonstrations; () if they have none.
+        state: SHA-256 of the system's state after the fit, to the precision of float32.
     """
 
     mse: float
@@ -67,14 +67,40 @@ class FitReport:
     state: str = ""
 
 
+@dataclass(frozen=True)
+class Learned:
+    """What a method tells of its learning; :meth:`StableDS.fit` makes the report of it.
+
+    Attributes:
+        mse, n_layers, history, notes: see :class:`FitReport`.
+        details: the further fields of the method's own ``report_type``.
+    """
+
+    mse: float
+    n_layers: int = 0
+    history: tuple[float, ...] = ()
+    notes: tuple[str, ...] = ()
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Python's own numbers of NumPy's or torch's: a report is kept in files."""
+        for name, value in {
+            "mse": float(self.mse),
+            "n_layers": int(self.n_layers),
+            "history": tuple(map(float, self.history)),
+            "notes": tuple(map(str, self.notes)),
+        }.items():
+            object.__setattr__(self, name, value)
+
+
 class StableDS(nn.Module, ABC):
     """A velocity field ẏ = f(y) on R^n, globally asymptotically stable at ``attractor``.
 
-    A new method subclasses this, implements :meth:`fit`, :meth:`forward` and :meth:`lyapunov`, and certifies itself
+    A new method subclasses this, implements :meth:`_learn`, :meth:`forward` and :meth:`lyapunov`, and certifies itself
     with :func:`latentds.testing.check_stable_ds`. An unfitted system is stable too.
 
-    Every ``fit`` is followed by a measurement that the method need not ask for: motions of the fitted system are held
-    against the demonstration (:mod:`latentds.fidelity`). The figures are in ``fit_report.fidelity``; what is off is in
+    :meth:`fit` is the same for every method and cannot be overridden. After learning it holds motions of the system
+    against the demonstration (:mod:`latentds.fidelity`): the figures are in ``fit_report.fidelity``; what is off is in
     ``fit_report.notes`` and in a :class:`~latentds.FitWarning`.
 
     Everything is computed in the module's dtype (float64 unless moved with ``.to``; float32 is the narrowest) and
@@ -84,8 +110,8 @@ class StableDS(nn.Module, ABC):
         dim: n >= 1.
 
     Attributes:
-        attractor: y*, (n,) buffer, where all motions end. It is for ``fit`` to write, in place, and cannot be replaced:
-            :meth:`with_goal` gives the system that ends elsewhere.
+        attractor: y*, (n,) buffer, where all motions end. Assigned to or written in place, motions end there, and what
+            was learned no longer fits: :meth:`with_goal` gives the system that moves as a whole.
     """
 
     report_type: ClassVar[type[FitReport]] = FitReport
@@ -101,9 +127,11 @@ class StableDS(nn.Module, ABC):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        fit = inspect.getattr_static(cls, "fit")
-        if inspect.isfunction(fit) and not getattr(fit, "__isabstractmethod__", False) and not hasattr(fit, "measured"):
-            cls.fit = _measured(fit)  # type: ignore[method-assign]
+        if cls.fit is not StableDS.fit:
+            raise TypeError(
+                f"{cls.__name__}: expected a method that writes _learn(shown, progress), got one that overrides fit, "
+                "which checks, measures, reports and restores for every method"
+            )
 
     @property
     def fit_report(self) -> FitReport | None:
@@ -121,9 +149,67 @@ class StableDS(nn.Module, ABC):
         """Whether ``fit_report`` tells of this system as it is: fitted, and neither trained nor edited since."""
         return self.fit_report is not None and self.fit_report.state == self._fingerprint()
 
-    @abstractmethod
+    @final
     def fit(self: Self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> Self:
-        """Learn from a demonstration (or several, where the method can); forgets any fit before; returns self."""
+        """Learn from a demonstration, or from several where the method can; forgets any fit before.
+
+        A fit is whole or did not happen: where it raises, and where it is interrupted, parameters, buffers, submodules,
+        attributes and report are what they were.
+
+        Args:
+            demonstration: of dimension ``dim``.
+            progress: show a bar, where the method takes long.
+
+        Returns:
+            self.
+
+        Raises:
+            ValueError: if this is no demonstration that the method can learn from.
+
+        Warns:
+            FitWarning: if the system does not follow what it was shown.
+        """
+        shown = demonstrations_of(demonstration, self.dim)
+        with _restored_on_failure(self):
+            report = self._learn_and_measure(shown, bool(progress))
+            self.fit_report = report
+            off = report.notes[-1:] if report.fidelity is None else report.fidelity.notes
+            if off:
+                text = f"{type(self).__name__} does not follow what it was shown: {'; '.join(off)}"
+                warnings.warn(text, FitWarning, stacklevel=2)
+        return self
+
+    @abstractmethod
+    def _learn(self, shown: Sequence[Demonstration], progress: bool) -> Learned:
+        """Change parameters and buffers, the attractor among them, so that this system moves as it is shown.
+
+        The method's own part of :meth:`fit`, which checks, measures, reports, and restores where this raises.
+
+        Args:
+            shown: at least one demonstration, all of dimension ``dim``; not to be changed.
+            progress: whether to show a bar.
+        """
+
+    def _learn_and_measure(self, shown: Sequence[Demonstration], progress: bool) -> FitReport:
+        began = time.perf_counter()
+        learned = self._learn(shown, progress)
+        if not isinstance(learned, Learned):
+            raise TypeError(f"{type(self).__name__}: expected _learn to return a Learned, got {type(learned).__name__}")
+        report = self.report_type(
+            mse=learned.mse,
+            n_layers=learned.n_layers,
+            seconds=time.perf_counter() - began,
+            history=learned.history,
+            notes=learned.notes,
+            learned_from=tuple(one.fingerprint for one in shown),
+            columns=next((one.columns for one in shown if one.columns), ()),
+            **learned.details,
+        )
+        try:
+            fidelity = measure(self, Excerpt.of_each(shown))
+        except ROLLOUT_ERRORS as error:
+            return replace(report, notes=(*report.notes, f"could not be measured, {type(error).__name__}: {error}"))
+        return replace(report, fidelity=fidelity, notes=report.notes + fidelity.notes)
 
     @abstractmethod
     def forward(self, y: Tensor) -> Tensor:
@@ -143,7 +229,7 @@ class StableDS(nn.Module, ABC):
         that cannot go on and is NaN from there.
         """
         points, wanted = self._points(y0, "y0")
-        return self._begun_at(y0, integrate(self.forward, points, self._times(t), self.attractor).to(wanted))
+        return self._with_exact_start(y0, integrate(self.forward, points, self._times(t), self.attractor).to(wanted))
 
     def controller(self, *, max_speed: float = math.inf) -> Controller:
         """The velocity field as it is now for a real-time loop, NumPy in and out: see :class:`Controller`."""
@@ -230,9 +316,13 @@ class StableDS(nn.Module, ABC):
 
     def __setattr__(self, name: str, value: Any) -> None:
         held = self.__dict__.get("_buffers", {}).get("attractor")
-        if name == "attractor" and held is not None and value is not held and not self.__dict__.get("_assigning"):
-            raise AttributeError("attractor: cannot be replaced; ds.with_goal(goal) is this motion to another goal")
-        super().__setattr__(name, value)
+        if name == "attractor" and held is not None and not self.__dict__.get("_assigning"):
+            if isinstance(value, Tensor) and value.requires_grad:
+                raise ValueError("attractor: expected a tensor without gradient, got one with; use ds.with_goal(goal)")
+            with torch.no_grad():
+                held.copy_(_vector(value, held, "attractor"))
+        else:
+            super().__setattr__(name, value)
 
     def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
         self.__dict__["_assigning"] = True  # load_state_dict(…, assign=True) replaces the attractor with all the rest
@@ -278,10 +368,36 @@ class StableDS(nn.Module, ABC):
         return (times - times[0]).to(self.attractor.dtype)
 
     @staticmethod
-    def _begun_at(y0: Any, path: Tensor) -> Tensor:
+    def _with_exact_start(y0: Any, path: Tensor) -> Tensor:
         """``path`` (..., T, n) with ``y0`` itself, not what rounding made of it, as its first point."""
         start = torch.as_tensor(y0).to(path.dtype)
         return torch.cat([start.unsqueeze(-2), path[..., 1:, :]], dim=-2)
+
+
+ROLLOUT_ERRORS = (ArithmeticError, AssertionError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+"""What a method's own code may raise while it is measured. A time-out or an interrupt is none of it: it ends a fit."""
+
+
+@contextmanager
+def _restored_on_failure(ds: StableDS) -> Iterator[None]:
+    """Within this context, what raises leaves the system as it was: the very tensors, their values and attributes."""
+    attributes = {module: _shallow_copy(module) for module in ds.modules()}
+    tensors = [*ds.parameters(), *ds.buffers()]
+    values = [tensor.detach().clone() for tensor in tensors]
+    try:
+        yield
+    except BaseException:
+        for module, before in attributes.items():
+            module.__dict__.clear()
+            module.__dict__.update(before)
+        for tensor, value in zip(tensors, values, strict=True):
+            tensor.data = value if tensor.shape != value.shape else tensor.data.copy_(value)
+        raise
+
+
+def _shallow_copy(module: nn.Module) -> dict[str, Any]:
+    """Its attributes, and its own dicts of parameters, buffers and submodules."""
+    return {name: value.copy() if isinstance(value, dict) else value for name, value in vars(module).items()}
 
 
 def _class_and_settings(ds: StableDS) -> dict[str, Any]:
@@ -304,59 +420,10 @@ def _vector(values: Any, like: Tensor, name: str) -> Tensor:
     return vector
 
 
-_UNDERWAY: ContextVar[tuple[int, ...]] = ContextVar("ids of the systems that are being fitted", default=())
-
-
-def _measured(fit: Callable[..., Any]) -> Callable[..., Any]:
-    """``fit`` as a method that holds the fitted system against what it was shown."""
-
-    @wraps(fit)
-    def measured_fit(self: StableDS, *args: Any, **kwargs: Any) -> Any:
-        return _fit(fit, self, args, kwargs)
-
-    measured_fit.measured = True  # type: ignore[attr-defined]
-    return measured_fit
-
-
-def _fit(fit: Callable[..., Any], ds: StableDS, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """Fit and measure: once where a fit calls the one that it overrides; told by the outermost of nested fits alone."""
-    underway = _UNDERWAY.get()
-    if id(ds) in underway:
-        return fit(ds, *args, **kwargs)
-    token = _UNDERWAY.set((*underway, id(ds)))
-    try:
-        fitted = fit(ds, *args, **kwargs)
-    finally:
-        _UNDERWAY.reset(token)
-    notes = _hold_against(ds, args[0] if args else kwargs.get("demonstration"))
-    if notes and not underway:
-        text = f"{type(ds).__name__} does not follow what it was shown: {'; '.join(notes)}"
-        warnings.warn(text, FitWarning, stacklevel=3)
-    return fitted
-
-
-def _hold_against(ds: StableDS, demonstration: Any) -> tuple[str, ...]:
-    """Put into the report how ``ds`` follows its demonstration; what is off."""
-    columns: tuple[str, ...] = ()
-    try:
-        shown = demonstrations_of(demonstration, ds.dim)
-        columns = next((one.columns for one in shown if one.columns), ())
-        fidelity = measure(ds, Excerpt.of_each(shown))
-        notes = fidelity.notes
-    except Exception as error:  # a method's own rollout may raise anything; the fit itself is done and stays
-        fidelity, notes = None, (f"could not be measured, {type(error).__name__}: {error}",)
-    report = ds.fit_report
-    if isinstance(report, FitReport):
-        told = () if report.fidelity is None else report.fidelity.notes
-        before = tuple(note for note in report.notes if note not in told)
-        ds.fit_report = replace(report, fidelity=fidelity, notes=before + notes, columns=columns)
-    return notes
-
-
 class LatentDS(StableDS):
     """A stable system made of a diffeomorphism ψ (latent -> demonstration) and latent dynamics.
 
-    f(y) = J_ψ(x) g(x) with x = ψ⁻¹(y) (paper, eq. 4), V(y) = ‖x - x*‖². Methods subclass it and implement ``fit``.
+    f(y) = J_ψ(x) g(x) with x = ψ⁻¹(y) (paper, eq. 4), V(y) = ‖x - x*‖². Methods subclass it and implement ``_learn``.
 
     What was shown is kept in demonstration space; its latent image, :meth:`frame`, follows from it. So the attractor
     stays where it is however ψ is trained, and where it is moved in place, motions end there.
@@ -412,6 +479,31 @@ class LatentDS(StableDS):
             return push_rows(tangents)[:-2].reshape(tangent.shape)
 
         return rows[:-2].reshape(y.shape), push, Frame.between(rows[-2], rows[-1])
+
+    @torch.no_grad()
+    def _refuse_folds(self, shown: Demonstration) -> None:
+        """Refuse a ψ that was fitted to a motion and does not lead back in floats, as it does on paper.
+
+        Raises:
+            ValueError: if ψ(ψ⁻¹(y)) is not y along the motion, or if the motion from its start, begun anew half-way, is
+                another one.
+        """
+        points = shown.positions.to(self.attractor)
+        gap = float(torch.linalg.vector_norm(shown.goal - shown.start))
+        off = float((self.decode(self.encode(points)) - points).abs().max()) / gap
+        times = torch.linspace(0, shown.duration, POINTS, dtype=torch.float64)
+        apart = restart_gap(self, self.rollout(points[0], times), times) / shown.size
+        rounding = torch.finfo(points.dtype).eps ** 0.4
+        if not off < rounding:
+            raise ValueError(
+                "demonstration: expected a motion whose map inverts in floats, got one that comes back off by "
+                f"{off:.1e} of the way from start to goal, which is {gap / shown.size:.1e} of its size"
+            )
+        if not apart <= max(ROUNDING, rounding):
+            raise ValueError(
+                "demonstration: expected a motion whose map inverts in floats, got one that rounding carries "
+                f"{apart:.1e} of its size away; try a smaller mu, fewer layers, or another method"
+            )
 
     def surroundings(self, ball: Tensor) -> Tensor:
         frame = self.frame()
@@ -478,7 +570,7 @@ class LatentDS(StableDS):
         points, wanted = self._points(y0, "y0")
         times = self._times(t)
         x, _, frame = self._linearize(points)
-        return self._begun_at(y0, self.diffeomorphism(self.dynamics.flow(x, times, frame)).to(wanted))
+        return self._with_exact_start(y0, self.diffeomorphism(self.dynamics.flow(x, times, frame)).to(wanted))
 
 
 class MovedDS(StableDS):
@@ -517,18 +609,16 @@ class MovedDS(StableDS):
     def report_type(self) -> type[FitReport]:  # type: ignore[override]
         return self.ds.report_type
 
-    def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> MovedDS:
+    def _learn(self, shown: Sequence[Demonstration], progress: bool) -> Learned:
+        return self.ds._learn(shown, progress)
+
+    def _learn_and_measure(self, shown: Sequence[Demonstration], progress: bool) -> FitReport:
         before, after = self.ds.attractor.clone(), self.attractor
-        theirs = demonstrations_of(demonstration, self.dim)
-        shown = [self.similarity.fetch_motion(one, before, after) for one in theirs]
-        self.ds.fit(shown[0] if isinstance(demonstration, Demonstration) else shown, progress=progress)
+        theirs = [self.similarity.fetch_motion(one, before, after) for one in shown]
+        report = self.ds._learn_and_measure(theirs, progress)
         with torch.no_grad():
             after.copy_(self.similarity.carry(self.ds.attractor, before, after))
-        if isinstance(report := self.fit_report, FitReport) and report.learned_from:
-            self.fit_report = replace(report, learned_from=tuple(one.fingerprint for one in theirs))
-        return self
-
-    fit.measured = True  # type: ignore[attr-defined]  # the fit inside measures itself
+        return replace(report, learned_from=tuple(one.fingerprint for one in shown))
 
     def excerpts(self) -> tuple[Excerpt, ...]:
         return tuple(
@@ -546,7 +636,7 @@ class MovedDS(StableDS):
     def rollout(self, y0: Tensor, t: Tensor) -> Tensor:
         points, wanted = self._points(y0, "y0")
         path = self.ds.rollout(self._inside(points), self.similarity.speed * self._times(t))
-        return self._begun_at(y0, self._outside(path).to(wanted))
+        return self._with_exact_start(y0, self._outside(path).to(wanted))
 
     def tables(self) -> FieldTables | None:
         inside = self.ds.tables()

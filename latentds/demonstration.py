@@ -265,9 +265,8 @@ def goal_apart(shown: Demonstration, goal: Tensor) -> float:
     return gap
 
 
-def only_demonstration(demonstration: Any, dim: int, method: str) -> Demonstration:
-    """The argument of ``fit`` for a method that learns from exactly one demonstration."""
-    found = demonstrations_of(demonstration, dim)
-    if len(found) != 1:
-        raise ValueError(f"demonstration: {method} learns from exactly one, got {len(found)}")
-    return found[0]
+def only_one(shown: Sequence[Demonstration], method: str) -> Demonstration:
+    """What is shown to a method that learns from exactly one demonstration."""
+    if len(shown) != 1:
+        raise ValueError(f"demonstration: {method} learns from exactly one, got {len(shown)}")
+    return shown[0]

@@ -119,7 +119,7 @@ class Fidelity:
             a quarter of the way to where the demonstration comes back to it.
         fastest: largest velocity on the demonstrated path and within ``BESIDE`` sizes of it, over the largest shown.
         rise: largest rise of V along the motion, over V at its start.
-        halves: largest distance of the motion from the same one begun anew half-way, in sizes.
+        restart_gap: largest distance of the motion from the same one begun anew half-way, in sizes.
         latent_error: see :meth:`~latentds.LatentDS.latent_error`; 0 for a system without latent space.
         spread: of several demonstrations, how far they miss each other: as ``miss``, each and the next. Nobody can
             follow all of them more closely, so it is added to what ``miss``, ``end`` and ``nearby`` may be.
@@ -132,7 +132,7 @@ class Fidelity:
     nearby: float
     fastest: float
     rise: float
-    halves: float
+    restart_gap: float
     latent_error: float = 0.0
     spread: float = 0.0
     shown: tuple[Excerpt, ...] = field(default=(), repr=False)
@@ -168,7 +168,10 @@ class Fidelity:
                 f"moves {self.fastest:.3g} times as fast as shown within {BESIDE:.0%} of the size from the path",
             ),
             (self.rise / ROUNDING, f"V rises by {self.rise:.3g} of itself along its motion"),
-            (self.halves / ROUNDING, f"its motion begun anew half-way is another one, {self.halves:.3g} sizes away"),
+            (
+                self.restart_gap / ROUNDING,
+                f"its motion begun anew half-way is another one, {self.restart_gap:.3g} sizes away",
+            ),
             (
                 self.latent_error / ROUNDING,
                 f"rounding breaks its map, encode(decode(x)) is {self.latent_error:.3g} latent lengths from x",
@@ -230,12 +233,12 @@ def _measure(ds: System, one: Excerpt, path: Array, duration: float, around: Arr
         "nearby": float(np.max(missed[1:], initial=0.0)),
         "fastest": float(torch.linalg.vector_norm(velocity, dim=-1).max()) / one.fastest,
         "rise": float(energy.diff().max() / energy[0]),
-        "halves": halves_apart(ds, moved[0], times) / size,
+        "restart_gap": restart_gap(ds, moved[0], times) / size,
         "latent_error": 0.0 if error is None else float(error.max()),
     }
 
 
-def halves_apart(ds: System, motion: Tensor, times: Tensor) -> float:
+def restart_gap(ds: System, motion: Tensor, times: Tensor) -> float:
     """Largest distance of a motion (T, n) at ``times`` (T,) from the same one begun anew half-way: 0 for a flow."""
     middle = len(times) // 2
     anew = ds.rollout(motion[middle], times[middle:])

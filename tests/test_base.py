@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 import pickle
 from dataclasses import replace
 
@@ -154,13 +155,18 @@ def test_functional_call_with_other_parameters_rests_too(ds):
         torch.testing.assert_close(slopes[name], parameter.grad, rtol=1e-6, atol=1e-9)
 
 
-def test_the_attractor_is_not_replaced_by_assignment(ds):
-    goal = ds.attractor.clone()
-    with pytest.raises(AttributeError, match=r"attractor: .*with_goal"):
-        ds.attractor = torch.ones(2)
-    assert torch.equal(ds.attractor, goal)
-    ds.attractor += 0.1  # in place
-    rests_at(ds, goal + 0.1)
+def test_an_attractor_that_is_assigned_to_is_written_in_place(ds):
+    buffer, goal = ds.attractor, ds.attractor.clone()
+    ds.attractor = (goal + 0.1).float()
+    assert ds.attractor is buffer
+    rests_at(ds, (goal + 0.1).float().double())
+    ds.attractor += 0.1
+    rests_at(ds, (goal + 0.1).float().double() + 0.1)
+    for wrong in ([1.0], [0.0, math.nan], "here"):
+        with pytest.raises(ValueError, match=r"^attractor: expected"):
+            ds.attractor = wrong
+    with pytest.raises(ValueError, match=r"^attractor: .*with_goal"):  # a gradient would be lost
+        ds.attractor = goal.clone().requires_grad_()
 
 
 def test_an_attractor_moved_in_place_moves_the_motion(ds):
@@ -182,8 +188,8 @@ def test_a_state_loads_with_its_attractor(ds, assign):
     fresh.load_state_dict(ds.state_dict(), assign=assign)
     assert torch.equal(fresh.attractor, ds.attractor)
     assert torch.equal(fresh(ds.start), ds(ds.start))
-    with pytest.raises(AttributeError):
-        fresh.attractor = torch.ones(2)
+    fresh.attractor = ds.start
+    rests_at(fresh, ds.start)
 
 
 def test_float32_follows_and_comes_back(ds):

@@ -13,8 +13,7 @@ import torch
 from scipy import stats
 
 from baselines import FDM
-from latentds import ChebyshevDS, Demonstration, StableDS, TubeDS, datasets, metrics
-from latentds.base import FitReport
+from latentds import ChebyshevDS, Demonstration, Learned, StableDS, TubeDS, datasets, metrics
 from latentds.benchmark import COLUMNS, Cell, Protocol, compare, run
 from latentds.fitting.matching import PINS
 from latentds.store import CellStore
@@ -26,11 +25,10 @@ TIMES = ["fit_seconds", "rollout_seconds"]
 class Straight(StableDS):
     """ẏ = -k (y - y*), k drawn at random: the smallest method, third-party style."""
 
-    def fit(self, demonstration, *, progress=False):
-        self.attractor.copy_(demonstration.goal)
+    def _learn(self, shown, progress):
+        self.attractor.copy_(shown[0].goal)
         self.register_buffer("rate", 1 + torch.rand((), dtype=torch.float64))
-        self.fit_report = FitReport(0.0, 1, 0.0)
-        return self
+        return Learned(0.0, 1)
 
     def forward(self, y):
         return -self.rate * (y - self.attractor)
@@ -60,28 +58,28 @@ class Lone(Straight):
 class Lost(Straight):
     """Converges, but not to the goal."""
 
-    def fit(self, demonstration, *, progress=False):
-        super().fit(demonstration)
+    def _learn(self, shown, progress):
+        learned = super()._learn(shown, progress)
         self.attractor += 0.01
-        return self
+        return learned
 
 
 class Slow(Straight):
-    def fit(self, demonstration, *, progress=False):
-        super().fit(demonstration)
+    def _learn(self, shown, progress):
+        learned = super()._learn(shown, progress)
         self.rate.fill_(0.01)
-        return self
+        return learned
 
 
 class Several(Straight):
     """Learns the goal of the first."""
 
-    def fit(self, demonstration, *, progress=False):
-        return super().fit(demonstration[0])
+    def _learn(self, shown, progress):
+        return super()._learn(shown[:1], progress)
 
 
 class Unfit(Straight):
-    def fit(self, demonstration, *, progress=False):
+    def _learn(self, shown, progress):
         raise RuntimeError("cannot learn this")
 
 
@@ -413,19 +411,19 @@ def ctrl_c():
 
 
 class GoesOn(Straight):
-    def fit(self, demonstration, *, progress=False):
+    def _learn(self, shown, progress):
         ctrl_c()
-        return super().fit(demonstration)
+        return super()._learn(shown, progress)
 
 
 class Stumbles(Straight):
-    def fit(self, demonstration, *, progress=False):
+    def _learn(self, shown, progress):
         ctrl_c()
         raise RuntimeError("no compiled object yet")
 
 
 class Raises(Straight):
-    def fit(self, demonstration, *, progress=False):
+    def _learn(self, shown, progress):
         try:
             signal.raise_signal(signal.SIGINT)
         except KeyboardInterrupt as interrupt:

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from latentds import Demonstration
-from latentds.demonstration import arc_lengths, demonstrations_of, jitter, only_demonstration
+from latentds.demonstration import arc_lengths, demonstrations_of, jitter, only_one
 
 
 @pytest.fixture
@@ -281,11 +281,11 @@ def test_what_is_no_file_is_refused_before_reading(tmp_path, suffix):
 def test_demonstrations_of(shown):
     assert demonstrations_of(shown, 2) == [shown]
     assert demonstrations_of((shown, shown), 2) == [shown, shown]
-    assert only_demonstration([shown], 2, "Method") is shown
+    assert only_one([shown], "Method") is shown
     with pytest.raises(ValueError, match="demonstration: expected dimension 3, got 2"):
         demonstrations_of([shown], 3)
     with pytest.raises(ValueError, match="demonstration: Method learns from exactly one, got 2"):
-        only_demonstration([shown, shown], 2, "Method")
+        only_one([shown, shown], "Method")
 
 
 def test_positions_at_any_time():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import pickle
 import warnings
-from contextlib import nullcontext
 from dataclasses import replace
 
 import cloudpickle
@@ -18,15 +17,14 @@ from baselines import FDM
 from latentds import (
     ChebyshevDS,
     Demonstration,
-    FitReport,
     FitWarning,
+    Learned,
     StableDS,
     TubeDS,
     certify,
     datasets,
 )
 from latentds.fidelity import MISS, MOST_POINTS, NEARBY_MISS, POINTS, Excerpt, Fidelity, measure
-from latentds.methods import greedy
 from latentds.testing import wavy_motion
 
 SHARE = np.linspace(0, 1, 1000)
@@ -165,10 +163,9 @@ class Follower(StableDS):
 
     tau = 1.0
 
-    def fit(self, demonstration, *, progress=False):
-        self.attractor.copy_(demonstration.goal)
-        self.fit_report = FitReport(0.0, 0, 0.0)
-        return self
+    def _learn(self, shown, progress):
+        self.attractor.copy_(shown[0].goal)
+        return Learned(0.0, 0)
 
     def forward(self, y):
         return -(y - self.attractor) / self.tau
@@ -281,10 +278,10 @@ def test_a_start_beside_a_goal_that_lies_near_it_is_not_asked_to_go_the_long_way
     """The goal is 0.3 % of the size from the start; 1 % beside it lies what no continuous field sends around."""
 
     class Tracks(Follower):
-        def fit(self, demonstration, *, progress=False):
-            super().fit(demonstration)
-            self.path = demonstration.positions
-            return self
+        def _learn(self, shown, progress):
+            learned = super()._learn(shown, progress)
+            self.path = shown[0].positions
+            return learned
 
         def rollout(self, y0, t):
             far = (torch.as_tensor(y0) - self.path[0]).norm(dim=-1) > 0.003
@@ -319,7 +316,7 @@ def test_a_rollout_of_another_shape_is_told():
 
 def test_a_fit_that_raises_is_not_measured():
     class Refuses(Follower):
-        def fit(self, demonstration, *, progress=False):
+        def _learn(self, shown, progress):
             raise ValueError("demonstration: no")
 
     with warnings.catch_warnings():
@@ -329,7 +326,7 @@ def test_a_fit_that_raises_is_not_measured():
         Follower(3).fit(decay())  # and the next fit is the outermost again
 
 
-def test_nested_fits_are_told_once():
+def test_a_method_that_lets_another_learn_is_told_once():
     class Holds(StableDS):
         """Another system does the work."""
 
@@ -337,11 +334,10 @@ def test_nested_fits_are_told_once():
             super().__init__(dim)
             self.inner = Follower(dim)
 
-        def fit(self, demonstration, *, progress=False):
-            self.inner.fit(demonstration)
+        def _learn(self, shown, progress):
+            learned = self.inner._learn(shown, progress)
             self.attractor.copy_(self.inner.attractor)
-            self.fit_report = self.inner.fit_report
-            return self
+            return learned
 
         def forward(self, y):
             return self.inner(y)
@@ -355,39 +351,83 @@ def test_nested_fits_are_told_once():
     with pytest.warns(FitWarning) as caught:
         ds = Holds(3).fit(datasets.unstable_spiral(3, 200))
     assert len(caught) == 1
-    assert ds.fit_report == ds.inner.fit_report
+    assert ds.inner.fit_report is None
     assert ds.fit_report.notes == ds.fit_report.fidelity.notes
 
 
-def test_a_fit_that_calls_the_one_it_overrides_is_measured_once(monkeypatch):
-    class Twice(Follower):
-        def fit(self, demonstration, *, progress=False):
-            super().fit(demonstration)
-            self.attractor += 0.0
-            return self
-
-    calls = []
-    monkeypatch.setattr(latentds.base, "measure", lambda *arguments: calls.append(arguments) or measure(*arguments))
-    Twice(3).fit(decay())
-    assert len(calls) == 1
+class FitsItself:
+    def fit(self, demonstration, *, progress=False):
+        return self
 
 
-def test_a_fit_from_a_mixin_is_measured():
-    class Fits:
-        def fit(self, demonstration, *, progress=False):
-            self.attractor.copy_(demonstration.goal)
-            self.fit_report = FitReport(0.0, 0, 0.0)
-            return self
-
-    class Mixed(Fits, Follower):
-        pass
-
-    assert Mixed(3).fit(decay()).fit_report.fidelity.follows
+@pytest.mark.parametrize("bases", [(Follower,), (FitsItself, Follower)], ids=["itself", "by a mixin"])
+def test_a_method_that_overrides_fit_is_refused_when_it_is_defined(bases):
+    own = {"fit": FitsItself.fit} if len(bases) == 1 else {}
+    with pytest.raises(
+        TypeError, match=r"^Mine: expected a method that writes _learn\(shown, progress\), got one that"
+    ):
+        type("Mine", bases, own)
 
 
-def test_fit_keeps_its_name_its_words_and_its_signature():
-    assert TubeDS.fit.__qualname__ == "TubeDS.fit"
-    assert list(latentds.base.inspect.signature(FDM.fit).parameters) == ["self", "demonstration", "progress"]
+class Ends(Exception):
+    """A user's own time-out, of a class that nobody knows."""
+
+
+@pytest.mark.parametrize("raised", [KeyboardInterrupt, TimeoutError, Ends, FitWarning, MemoryError])
+@pytest.mark.parametrize("during", ["learning", "measuring"])
+def test_a_fit_is_whole_or_did_not_happen(raised, during):
+    class Breaks(TubeDS):
+        broken = False
+
+        def _learn(self, shown, progress):
+            learned = super()._learn(shown, progress)
+            self.remembered = shown
+            if self.broken and during == "learning":
+                raise raised
+            return learned
+
+        def rollout(self, y0, t):
+            if self.broken and during == "measuring" and hasattr(self, "remembered"):
+                raise raised
+            return super().rollout(y0, t)
+
+    ds = Breaks(3, n_layers=20, refined=False, homotopy="linear").fit(decay())
+    del ds.remembered
+    law, tensors, report = ds.dynamics.law, dict(ds.state_dict(keep_vars=True)), ds.fit_report
+    values = {name: tensor.clone() for name, tensor in tensors.items()}
+    ds.broken = True
+    with pytest.raises(raised):
+        ds.fit(datasets.unstable_spiral(1, 200))
+    assert ds.dynamics.law is law
+    assert ds.fit_report is report
+    assert not hasattr(ds, "remembered")
+    for name, tensor in ds.state_dict(keep_vars=True).items():
+        assert tensor is tensors[name]
+        assert torch.equal(tensor, values[name])
+
+
+def test_a_warning_that_is_an_error_leaves_the_fit_before():
+    ds = Follower(3).fit(decay())
+    report, goal = ds.fit_report, ds.attractor.clone()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", FitWarning)
+        with pytest.raises(FitWarning):
+            ds.fit(datasets.unstable_spiral(3, 200))
+    assert ds.fit_report is report
+    assert torch.equal(ds.attractor, goal)
+
+
+@pytest.mark.parametrize(
+    "learned", [Learned(np.float32(0.5), np.int64(3), [np.float32(1)]), Learned(torch.tensor(0.5), 3, (1,))]
+)
+def test_a_report_holds_pythons_own_numbers(learned):
+    class Reports(Follower):
+        def _learn(self, shown, progress):
+            super()._learn(shown, progress)
+            return learned
+
+    report = Reports(3).fit(decay()).fit_report
+    assert [type(value) for value in (report.mse, report.n_layers, *report.history)] == [float, int, float]
 
 
 def test_a_refit_forgets_what_was_off():
@@ -400,8 +440,8 @@ def test_a_class_from_a_notebook_travels():
     """cloudpickle sends a class of the calling script by value, its fit included."""
 
     class Local(Follower):
-        def fit(self, demonstration, *, progress=False):
-            return super().fit(demonstration)
+        def _learn(self, shown, progress):
+            return super()._learn(shown, progress)
 
     there = pickle.loads(cloudpickle.dumps(Local))
     assert there(3).fit(decay()).fit_report.fidelity.follows
@@ -477,7 +517,7 @@ def test_an_excerpt_that_is_none_is_refused(change, message):
 
 def test_figures_that_are_no_numbers_do_not_pass():
     good = Follower(3).fit(decay()).fit_report.fidelity
-    for name in ("miss", "length_ratio", "end", "nearby", "fastest", "rise", "halves", "latent_error"):
+    for name in ("miss", "length_ratio", "end", "nearby", "fastest", "rise", "restart_gap", "latent_error"):
         assert not replace(good, **{name: float("nan")}).follows
     assert isinstance(good, Fidelity)
     assert "path" not in repr(good)
@@ -510,7 +550,7 @@ def test_a_map_that_floats_lose_is_refused_or_said():
 
 
 def test_a_certificate_tells_what_floats_lose(monkeypatch):
-    monkeypatch.setattr(greedy, "restore_on_failure", lambda *_: nullcontext())
+    monkeypatch.setattr(ChebyshevDS, "_refuse_folds", lambda *_: None)
     ds = ChebyshevDS(2).fit(planar_spiral(5, True))
     falsified = {line.claim for line in certify(ds, n_samples=40).falsified}
     assert {"encode inverts decode", "V falls along motions", "a motion is its two halves"} <= falsified

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import sys
-import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -93,22 +92,18 @@ def test_the_fuzzer_tells_a_broken_promise(monkeypatch):
             return -super().forward(y)
 
     class Crashes(FDM):
-        def fit(self, demonstration, *, progress=False):
+        def _learn(self, shown, progress):
             raise IndexError("off by one")
 
     class Mumbles(FDM):
-        def fit(self, demonstration, *, progress=False):
+        def _learn(self, shown, progress):
             raise ValueError("no")
 
     class Forgets(FDM):
-        """Learns a part, and keeps the measurement out."""
+        """Learns a part, and is held against that part alone."""
 
-        def fit(self, demonstration, *, progress=False):
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                return super().fit(Demonstration(demonstration.positions[-30:], demonstration.dt), progress=progress)
-
-        fit.measured = True
+        def _learn_and_measure(self, shown, progress):
+            return super()._learn_and_measure([Demonstration(shown[0].positions[-30:], shown[0].dt)], progress)
 
     stubs = {Unstable: "V decreases", Crashes: "off by one", Mumbles: "names no", Forgets: "a silent misfit off by"}
     for broken, message in stubs.items():

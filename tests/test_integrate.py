@@ -10,8 +10,8 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import nn
 
-from latentds import ChebyshevDS, FitReport, StableDS
-from latentds.demonstration import only_demonstration
+from latentds import ChebyshevDS, Learned, StableDS
+from latentds.demonstration import only_one
 from latentds.integrate import integrate
 from latentds.testing import check_stable_ds, wavy_motion
 
@@ -225,14 +225,13 @@ class Descent(StableDS):
         self.rates = nn.Parameter(torch.logspace(0, np.log10(fastest), dim, dtype=F64))
         self.register_buffer("size", torch.ones((), dtype=F64))
 
-    def fit(self, demonstration, *, progress=False):
-        shown = only_demonstration(demonstration, self.dim, "Descent")
-        self.attractor.copy_(shown.goal)
-        self.size.fill_(shown.size)
+    def _learn(self, shown, progress):
+        motion = only_one(shown, "Descent")
+        self.attractor.copy_(motion.goal)
+        self.size.fill_(motion.size)
         with torch.no_grad():
-            missed = self(shown.positions) - shown.velocities
-        self.fit_report = FitReport(float(missed.square().mean()), 0, 0.0)
-        return self
+            missed = self(motion.positions) - motion.velocities
+        return Learned(float(missed.square().mean()), 0)
 
     def forward(self, y):
         points, wanted = self._points(y)

@@ -72,7 +72,7 @@ def test_dtw_bars_shows_means_of_the_perturbed_starts():
 
 def test_dtw_bars_survives_a_method_that_failed():
     class Fails(ChebyshevDS):
-        def fit(self, demonstration, *, progress=False):
+        def _learn(self, shown, progress):
             raise ArithmeticError("on purpose")
 
     shown = datasets.unstable_spiral(1, 40)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import random
 import sys
 
@@ -12,8 +13,8 @@ import torch
 from torch import nn
 
 import latentds
-from latentds import Demonstration, FitReport, LatentDS, LocallyWeightedTranslations, StableDS
-from latentds.demonstration import only_demonstration
+from latentds import LatentDS, Learned, LocallyWeightedTranslations, StableDS
+from latentds.demonstration import only_one
 from latentds.dynamics import RayDynamics
 from latentds.testing import check_stable_ds, parametrize_stable_ds, wavy_motion
 from latentds.testing.clauses import CLAUSES, FIT_CLAUSES
@@ -29,14 +30,13 @@ class Plain(StableDS):
         super().__init__(dim)
         self.rate = nn.Parameter(torch.ones((), dtype=torch.float64))
 
-    def fit(self, demonstration, *, progress=False):
-        shown = only_demonstration(demonstration, self.dim, "Plain")
-        self.attractor.copy_(shown.goal)
+    def _learn(self, shown, progress):
+        motion = only_one(shown, "Plain")
+        self.attractor.copy_(motion.goal)
         with torch.no_grad():
-            self.rate.fill_(3 / shown.duration)
-            missed = self(shown.positions) - shown.velocities
-        self.fit_report = FitReport(float(missed.square().mean()), 0, 0.0)
-        return self
+            self.rate.fill_(3 / motion.duration)
+            missed = self(motion.positions) - motion.velocities
+        return Learned(float(missed.square().mean()), 0)
 
     def forward(self, y):
         points, wanted = self._points(y)
@@ -61,15 +61,14 @@ class Latent(LatentDS):
         psi = LocallyWeightedTranslations(dim, 2)
         super().__init__(dim, psi, RayDynamics(PiecewiseLinearLaw.uniform()))
 
-    def fit(self, demonstration, *, progress=False):
-        shown = only_demonstration(demonstration, self.dim, "Latent")
+    def _learn(self, shown, progress):
+        motion = only_one(shown, "Latent")
         psi = self.diffeomorphism
-        centers = torch.stack([shown.start, shown.goal])
-        psi.assign(centers, torch.full_like(centers, 0.1 * shown.size), torch.full((2,), 1.5 / shown.size))
-        self.attractor.copy_(shown.goal)
-        self.start.copy_(shown.start)
-        self.fit_report = FitReport(0.0, 2, 0.0)
-        return self
+        centers = torch.stack([motion.start, motion.goal])
+        psi.assign(centers, torch.full_like(centers, 0.1 * motion.size), torch.full((2,), 1.5 / motion.size))
+        self.attractor.copy_(motion.goal)
+        self.start.copy_(motion.start)
+        return Learned(0.0, 2)
 
 
 def test_accepts_honest_methods():
@@ -93,10 +92,10 @@ class HasTwoEquilibria(Plain):
 
 
 class HasAnotherAttractor(Plain):
-    def fit(self, demonstration, *, progress=False):
-        super().fit(demonstration)
-        self.attractor.copy_(demonstration.start)
-        return self
+    def _learn(self, shown, progress):
+        learned = super()._learn(shown, progress)
+        self.attractor.copy_(shown[0].start)
+        return learned
 
 
 class MovesAtTheAttractor(Plain):
@@ -215,32 +214,31 @@ class CannotBePickled(Plain):
 
 
 class ReturnsNothing(Plain):
-    def fit(self, demonstration, *, progress=False):
-        super().fit(demonstration)
+    def _learn(self, shown, progress):
+        super()._learn(shown, progress)
 
 
-class LeavesNoReport(Plain):
-    def fit(self, demonstration, *, progress=False):
-        super().fit(demonstration)
-        self.fit_report = None
-        return self
+class ReportsNoNumber(Plain):
+    def _learn(self, shown, progress):
+        super()._learn(shown, progress)
+        return Learned(math.nan)
 
 
 class RemembersTheLastFit(Plain):
-    def fit(self, demonstration, *, progress=False):
+    def _learn(self, shown, progress):
         before = self.rate.item()
-        super().fit(demonstration)
+        learned = super()._learn(shown, progress)
         with torch.no_grad():
             self.rate.add_(0.1 * before)
-        return self
+        return learned
 
 
 class IgnoresTheSeed(Plain):
-    def fit(self, demonstration, *, progress=False):
-        super().fit(demonstration)
+    def _learn(self, shown, progress):
+        learned = super()._learn(shown, progress)
         with torch.no_grad():
             self.rate.mul_(1 + random.random())
-        return self
+        return learned
 
 
 class DependsOnUnits(Plain):
@@ -249,35 +247,35 @@ class DependsOnUnits(Plain):
 
 
 class ChangesTheDefaultDtype(Plain):
-    def fit(self, demonstration, *, progress=False):
+    def _learn(self, shown, progress):
         torch.set_default_dtype(torch.float64)
-        return super().fit(demonstration)
+        return super()._learn(shown, progress)
 
 
 class ChangesThreads(Plain):
-    def fit(self, demonstration, *, progress=False):
+    def _learn(self, shown, progress):
         torch.set_num_threads(torch.get_num_threads() + 1)
-        return super().fit(demonstration)
+        return super()._learn(shown, progress)
 
 
 class SeedsTorch(Plain):
-    def fit(self, demonstration, *, progress=False):
+    def _learn(self, shown, progress):
         torch.manual_seed(0)
-        return super().fit(demonstration)
+        return super()._learn(shown, progress)
 
 
 class SeedsNumPy(Plain):
-    def fit(self, demonstration, *, progress=False):
+    def _learn(self, shown, progress):
         np.random.seed(0)  # noqa: NPY002
-        return super().fit(demonstration)
+        return super()._learn(shown, progress)
 
 
 class DrawsFromEntropy(Plain):
-    def fit(self, demonstration, *, progress=False):
-        super().fit(demonstration)
+    def _learn(self, shown, progress):
+        learned = super()._learn(shown, progress)
         with torch.no_grad():
             self.rate.mul_(1 + random.SystemRandom().random())
-        return self
+        return learned
 
 
 class DrawsWhenEvaluated(Plain):
@@ -315,18 +313,6 @@ class AnswersAnyDimension(Plain):
             return torch.zeros(())
 
 
-class FitsAnyDimension(Plain):
-    def fit(self, demonstration, *, progress=False):
-        cut = Demonstration(demonstration.positions[:, : self.dim], demonstration.dt)
-        return super().fit(cut)
-
-
-class ForgetsInARefusedFit(Plain):
-    def fit(self, demonstration, *, progress=False):
-        self.attractor.zero_()
-        return super().fit(demonstration)
-
-
 class RemembersItsLatentAttractor(Latent):
     """What its frame was at first, whatever the map has become."""
 
@@ -334,38 +320,30 @@ class RemembersItsLatentAttractor(Latent):
         super().__init__(dim)
         self.known = super().frame()
 
-    def fit(self, demonstration, *, progress=False):
-        super().fit(demonstration)
+    def _learn(self, shown, progress):
+        learned = super()._learn(shown, progress)
         with torch.no_grad():
             self.known = super().frame()
-        return self
+        return learned
 
     def _linearize(self, y):
         return *super()._linearize(y)[:2], self.known
 
 
-class ReportsTooEarly(Plain):
-    def fit(self, demonstration, *, progress=False):
-        super().fit(demonstration)
-        with torch.no_grad():
-            self.rate *= 2
-        return self
-
-
 class KeepsAView(Plain):
     """The attractor lies in the demonstration's memory."""
 
-    def fit(self, demonstration, *, progress=False):
-        super().fit(demonstration)
-        self.register_buffer("attractor", demonstration.goal)
-        return self
+    def _learn(self, shown, progress):
+        learned = super()._learn(shown, progress)
+        self.register_buffer("attractor", shown[0].goal)
+        return learned
 
 
 class ChangesTheDemonstration(Plain):
-    def fit(self, demonstration, *, progress=False):
-        super().fit(demonstration)
-        demonstration.positions.sub_(demonstration.goal.clone())
-        return self
+    def _learn(self, shown, progress):
+        learned = super()._learn(shown, progress)
+        shown[0].positions.sub_(shown[0].goal.clone())
+        return learned
 
 
 class ReadsTheClock(Plain):
@@ -461,15 +439,12 @@ BROKEN = {
     RoundsTheStart: "check_dtypes: rollout of torch.float64 input does not begin at y0",
     KeepsAFloat32Attractor: "check_attractor: expected float64",
     AnswersAnyDimension: "check_dimensions: V of shape .* got an answer",
-    FitsAnyDimension: "check_dimensions: fit .* got an answer",
-    ForgetsInARefusedFit: "check_dimensions: after a refused fit",
     DropsABuffer: "check_serialization: after state_dict",
     HidesTheAttractor: "check_attractor: no buffer",
     CannotBePickled: "check_serialization: pickle",
-    ReturnsNothing: "check_report: return self",
-    LeavesNoReport: "check_report: fit_report",
+    ReturnsNothing: "the factory: expected _learn to return a Learned, got NoneType",
+    ReportsNoNumber: "check_report: mse is nan",
     RemembersItsLatentAttractor: "check_training: speed",
-    ReportsTooEarly: "check_report: set it last",
     KeepsAView: "check_memory: attractor after the demonstration was changed",
     ChangesTheDemonstration: "check_memory: the demonstration after fit",
     RemembersTheLastFit: "check_repeatability: refit",
@@ -526,7 +501,7 @@ def test_rejects_another_error_than_a_value_error(name, called, monkeypatch):
         check_stable_ds(Latent, dims=[2], fitted=[False])
 
 
-class HasTwoFaults(MovesAtTheAttractor, LeavesNoReport):
+class HasTwoFaults(MovesAtTheAttractor, ReportsNoNumber):
     pass
 
 
@@ -545,7 +520,7 @@ def test_a_factory_that_fails_in_one_dimension_does_not_hide_the_others():
     def factory(dim):
         if dim == 2:
             raise RuntimeError("not in the plane")
-        return LeavesNoReport(dim)
+        return ReportsNoNumber(dim)
 
     with pytest.raises(AssertionError, match=r"the factory \(2-D, unfitted\).* not in the plane") as caught:
         check_stable_ds(factory, dims=[1, 2, 3])
@@ -553,12 +528,12 @@ def test_a_factory_that_fails_in_one_dimension_does_not_hide_the_others():
 
 
 def test_expected_failures():
-    reason = {"check_report": "leaves none by design"}
-    check_stable_ds(LeavesNoReport, dims=[1, 2], expected_failures=reason)
+    reason = {"check_report": "has none by design"}
+    check_stable_ds(ReportsNoNumber, dims=[1, 2], expected_failures=reason)
     with pytest.raises(AssertionError, match="check_equilibrium") as caught:
         check_stable_ds(HasTwoFaults, dims=[2], expected_failures=reason)
     assert "check_report" not in str(caught.value)
-    with pytest.raises(AssertionError, match=r"^Plain \(2-D, fitted\) keeps check_report.* leaves none by design$"):
+    with pytest.raises(AssertionError, match=r"^Plain \(2-D, fitted\) keeps check_report.* has none by design$"):
         check_stable_ds(Plain, dims=[2], expected_failures=reason)
 
 
@@ -585,10 +560,10 @@ def test_expected_failures_are_of_given_labels():
 class CountsFits(Latent):
     fits = 0
 
-    def fit(self, demonstration, *, progress=False):
-        super().fit(demonstration)
+    def _learn(self, shown, progress):
+        learned = super()._learn(shown, progress)
         CountsFits.fits += 1
-        return self
+        return learned
 
 
 def items(factories, **chosen):
@@ -634,7 +609,7 @@ def test_one_pytest_item_per_clause(pytester):
         stubs = sys.modules[{__name__!r}]
 
         @parametrize_stable_ds(
-            {{"honest": stubs.Plain, "silent": stubs.LeavesNoReport, "runaway": stubs.RunsAway}},
+            {{"honest": stubs.Plain, "silent": stubs.ReportsNoNumber, "runaway": stubs.RunsAway}},
             dims=[2],
             expected_failures={{
                 "honest": {{"check_flow": "a lie"}},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,9 +13,9 @@ from torch import Tensor
 
 from baselines import SDSEF
 from latentds import Demonstration
-from latentds.base import FitReport, StableDS
+from latentds.base import Learned, StableDS
 from latentds.benchmark import Cell
-from latentds.demonstration import only_demonstration
+from latentds.demonstration import only_one
 from latentds.metrics import mse
 
 TEST_SHARE = 0.3
@@ -39,21 +40,18 @@ class HeldOut(StableDS):
         self.learner = SDSEF(dim, n_layers=n_layers, n_features=n_features, recipe="official", seed=0, epochs=epochs)
         self.n_layers, self.n_features, self.epochs = n_layers, n_features, epochs
 
-    def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> HeldOut:
-        shown = only_demonstration(demonstration, self.dim, "HeldOut")
-        count, times = len(shown), shown.times.numpy()
+    def _learn(self, shown: Sequence[Demonstration], progress: bool) -> Learned:
+        motion = only_one(shown, "HeldOut")
+        count, times = len(motion), motion.times.numpy()
         test = np.sort(1 + np.random.default_rng(0).permutation(count - 2)[: round(TEST_SHARE * count)])
         train = np.setdiff1d(np.arange(count), test)
         even = np.linspace(0, times[-1], len(train))
-        curve = CubicSpline(times[train], shown.positions.numpy()[train])
-        self.learner.fit(Demonstration(curve(even), float(even[1]), shown.name), progress=progress)
-        self.attractor.copy_(shown.goal)
-        report = self.learner.fit_report
-        assert report is not None
+        curve = CubicSpline(times[train], motion.positions.numpy()[train])
+        learned = self.learner._learn([Demonstration(curve(even), float(even[1]), motion.name)], progress)
+        self.attractor.copy_(motion.goal)
         with torch.no_grad():
-            missed = mse(self(shown.positions[test]), shown.velocities[test])
-        self.fit_report = FitReport(missed, report.n_layers, report.seconds, report.history, report.notes)
-        return self
+            missed = mse(self(motion.positions[test]), motion.velocities[test])
+        return replace(learned, mse=missed)
 
     def forward(self, y: Tensor) -> Tensor:
         velocity: Tensor = self.learner(y)

@@ -11,9 +11,9 @@ from experiments.methods import greedy
 from experiments.motions import spiral
 from experiments.published import Setting
 from latentds import Demonstration
-from latentds.base import LatentDS
+from latentds.base import LatentDS, Learned
 from latentds.benchmark import Cell
-from latentds.demonstration import only_demonstration
+from latentds.demonstration import only_one
 from latentds.dynamics import RayDynamics, TubeDynamics
 from latentds.methods.greedy import GreedyDS
 from latentds.time_law import PiecewiseLinearLaw
@@ -34,17 +34,17 @@ class Variant(LatentDS):
         super().__init__(base.dim, base.diffeomorphism, base.dynamics)
         self.base, self.contraction, self.printed = base, contraction, printed
 
-    def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> Variant:
-        shown = only_demonstration(demonstration, self.dim, "Variant")
-        self.fit_report = self.base.fit(shown).fit_report
+    def _learn(self, shown: Sequence[Demonstration], progress: bool) -> Learned:
+        motion = only_one(shown, "Variant")
+        learned = self.base._learn(shown, progress)
         if self.contraction is not None:
-            across = PiecewiseLinearLaw(torch.ones(1), torch.tensor([self.contraction / shown.duration]))
+            across = PiecewiseLinearLaw(torch.ones(1), torch.tensor([self.contraction / motion.duration]))
             self.dynamics = TubeDynamics(self.base.dynamics.law, across)
         with torch.no_grad():
             # The latent line runs from the start to the goal themselves, so x_N is the goal.
-            self.attractor.copy_(self.decode(shown.goal) if self.printed else shown.goal)
-            self.start.copy_(shown.start)
-        return self
+            self.attractor.copy_(self.decode(motion.goal) if self.printed else motion.goal)
+            self.start.copy_(motion.start)
+        return learned
 
 
 class Change(NamedTuple):

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..base import LatentDS
-from ..demonstration import Demonstration, goal_apart
 from ..diffeomorphism import WIDTH_BOUND, Layers, LocallyWeightedTranslations
-from ..fidelity import POINTS, ROUNDING, halves_apart
 from ..kernels.greedy import greedy_kernel
 from .strands import Strands
 
@@ -143,36 +139,3 @@ def apply_layers(layers: Layers, x: Array) -> Array:
     psi.assign(*(torch.from_numpy(part) for part in layers))
     moved: Array = psi(torch.from_numpy(x)).numpy()
     return moved
-
-
-@contextmanager
-def restore_on_failure(ds: LatentDS, shown: Demonstration) -> Iterator[None]:
-    """A fit to a motion that ends apart from its start; one that fails leaves ``ds`` as it was.
-
-    Invertible on paper is not invertible in floats: a map that does not lead back is refused, and one under which the
-    motion from the demonstrated start, begun anew half-way, is another one.
-    """
-    gap = goal_apart(shown, shown.goal)
-    before, report = {name: value.clone() for name, value in ds.state_dict().items()}, ds.fit_report
-    try:
-        yield
-        with torch.no_grad():
-            points = shown.positions.to(ds.attractor)
-            off = float((ds.decode(ds.encode(points)) - points).abs().max()) / gap
-            times = torch.linspace(0, shown.duration, POINTS, dtype=torch.float64)
-            apart = halves_apart(ds, ds.rollout(points[0], times), times) / shown.size
-        rounding = torch.finfo(points.dtype).eps ** 0.4
-        if not off < rounding:
-            raise ValueError(
-                "demonstration: expected a motion whose map inverts in floats, got one that comes back off by "
-                f"{off:.1e} of the way from start to goal, which is {gap / shown.size:.1e} of its size"
-            )
-        if not apart <= max(ROUNDING, rounding):
-            raise ValueError(
-                "demonstration: expected a motion whose map inverts in floats, got one that rounding carries "
-                f"{apart:.1e} of its size away; try a smaller mu, fewer layers, or another method"
-            )
-    except BaseException:
-        ds.load_state_dict(before)
-        ds.fit_report = report
-        raise

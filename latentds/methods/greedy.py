@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import time
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ..arguments import number_in, whole_number
-from ..base import FitReport, LatentDS
-from ..demonstration import Demonstration, only_demonstration
+from ..base import LatentDS, Learned
+from ..demonstration import Demonstration, goal_apart, only_one
 from ..diffeomorphism import LocallyWeightedTranslations
 from ..dynamics import RayDynamics
 from ..fitting.homotopy import linear_homotopy
-from ..fitting.matching import PINS, match_along, pin_ends, restore_on_failure
+from ..fitting.matching import PINS, match_along, pin_ends
 from ..fitting.refinement import refine
 from ..fitting.tuning import tuned
 from ..time_law import TimeLaw
-
-Self = TypeVar("Self", bound="GreedyDS")
-
 
 BETA, MU = 0.5, 0.9
 """The defaults of β and μ."""
@@ -85,27 +80,24 @@ class GreedyDS(LatentDS):
     def time_law(duration: float) -> TimeLaw:
         """How fast the latent point moves, for a demonstration of so many seconds."""
 
-    def fit(self: Self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> Self:
-        shown = only_demonstration(demonstration, self.dim, type(self).__name__)
-        began = time.perf_counter()
-        psi, points = self.diffeomorphism, shown.positions.numpy()
-        latent = self.latent_line(shown)
-        with restore_on_failure(self, shown):
-            n_layers, beta, mu, notes = self._hyperparameters(latent, points)
-            layers = match_along(linear_homotopy(latent, points, self.steps), n_layers, beta, mu)
-            if self.refined:
-                layers = refine(layers, latent, points, mu)
-            if self.pinned:
-                layers = pin_ends(layers, latent, points, mu)
-            psi.assign(*(torch.from_numpy(part) for part in layers))
-            self.dynamics.law = self.time_law(shown.duration).to(self.attractor)
-            with torch.no_grad():
-                self.attractor.copy_(shown.goal)
-                self.start.copy_(shown.start)
-                missed = psi(torch.from_numpy(latent).to(self.attractor)) - shown.positions.to(self.attractor)
-            mse, seconds = float(missed.square().mean()), time.perf_counter() - began
-            self.fit_report = FitReport(mse, psi.n_layers, seconds, notes=notes, learned_from=(shown.fingerprint,))
-        return self
+    def _learn(self, shown: Sequence[Demonstration], progress: bool) -> Learned:
+        motion = only_one(shown, type(self).__name__)
+        goal_apart(motion, motion.goal)
+        psi, points, latent = self.diffeomorphism, motion.positions.numpy(), self.latent_line(motion)
+        n_layers, beta, mu, notes = self._hyperparameters(latent, points)
+        layers = match_along(linear_homotopy(latent, points, self.steps), n_layers, beta, mu)
+        if self.refined:
+            layers = refine(layers, latent, points, mu)
+        if self.pinned:
+            layers = pin_ends(layers, latent, points, mu)
+        psi.assign(*(torch.from_numpy(part) for part in layers))
+        self.dynamics.law = self.time_law(motion.duration).to(self.attractor)
+        with torch.no_grad():
+            self.attractor.copy_(motion.goal)
+            self.start.copy_(motion.start)
+            missed = psi(torch.from_numpy(latent).to(self.attractor)) - motion.positions.to(self.attractor)
+        self._refuse_folds(motion)
+        return Learned(float(missed.square().mean()), psi.n_layers, notes=notes)
 
     def _hyperparameters(
         self, latent: NDArray[np.float64], points: NDArray[np.float64]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..arguments import number_in
-from ..base import FitReport, LatentDS
-from ..demonstration import Demonstration, demonstrations_of, jitter
+from ..base import FitReport, LatentDS, Learned
+from ..demonstration import Demonstration, goal_apart, jitter
 from ..diffeomorphism import Layers, LocallyWeightedTranslations
 from ..dynamics import TubeDynamics
 from ..fidelity import Excerpt, measure
@@ -28,7 +28,7 @@ from ..fitting.homotopy import (
     linear_homotopy,
     zoom_homotopy,
 )
-from ..fitting.matching import apply_layers, match_along, pin_ends, restore_on_failure, track
+from ..fitting.matching import apply_layers, match_along, pin_ends, track
 from ..fitting.refinement import refine
 from ..fitting.strands import Strands, crowded, segment_distances
 from ..metrics import dtw
@@ -167,46 +167,46 @@ class TubeDS(LatentDS):
             raise ValueError(f"homotopy: expected one of {known} in {self.dim} dimensions, got {homotopy!r}")
         self.homotopy = homotopy
 
-    def fit(self, demonstration: Demonstration | Sequence[Demonstration], *, progress: bool = False) -> TubeDS:
-        began = time.perf_counter()
-        every = demonstrations_of(demonstration, self.dim)
-        shown, strands, arrivals = mean_motion(every)
+    def _learn(self, demonstrations: Sequence[Demonstration], progress: bool) -> Learned:
+        shown, strands, arrivals = mean_motion(demonstrations)
         # L-BFGS runs on to another match from another rounding, so that none may come from the units or the origin.
         origin, unit = shown.goal.numpy(), shown.size
         shape = Demonstration(((shown.positions - shown.goal) / unit).round(decimals=DECIMALS), shown.dt)
         path, way, times = arc_length_path(shape.positions.numpy(), shape.times.numpy(), N_POINTS)
         _refuse_crossings(path, origin, unit)
-        several = Several((strands - origin) / unit, arrivals) if len(every) > 1 else None
-        with restore_on_failure(self, shown):
-            law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
-            judged = []
-            for candidate in _candidates(path, self.n_layers or DEPTHS[0], self.homotopy):
-                tube = candidate.widened(path, FIRST_STEPS) if several and self.refined else candidate
-                judged.append((self._score(tube, path, shape, law, several), tube))
-            judged.sort(key=lambda pair: pair[0])
-            if self.refined:
-                for tried, (score, candidate) in enumerate(list(judged)):
-                    close = tried < TRIES and score < CLOSE * judged[0][0]
-                    enough = min(score for score, _ in judged) < GOOD_SCORE * (1 if tried < TRIES else 3)
-                    hopeless = self.n_layers is None and tried >= TRIES and min(score for score, _ in judged) > HOPELESS
-                    if tried and (enough or hopeless) and not close:
-                        break
-                    better = candidate.widened(path, STEPS) if several else candidate.refined(path)
-                    judged.append((self._score(better, path, shape, law, several), better))
-            found = min(judged, key=lambda pair: pair[0])[1]
-            notes: tuple[str, ...] = ()
-            if self.n_layers is None:
-                found, notes = self._followed(found, path, shape, law)
-            best = found.placed(origin, unit)
-            kappa = self.contraction or JUDGED
-            if several:
-                law, kappa, _ = self._settled(found, shape, law, several)
-            self._take(best, shown, law, kappa)
-            report = self._report(best, origin + unit * path, shown, began)
-            spread = tuple(float(value) for value in strands.std(0).mean(0))
-            report = replace(report, notes=notes, spread=spread, contraction=kappa)
-            self.fit_report = replace(report, learned_from=tuple(one.fingerprint for one in every))
-        return self
+        goal_apart(shown, shown.goal)
+        several = Several((strands - origin) / unit, arrivals) if len(demonstrations) > 1 else None
+        law = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
+        judged = []
+        for candidate in _candidates(path, self.n_layers or DEPTHS[0], self.homotopy):
+            tube = candidate.widened(path, FIRST_STEPS) if several and self.refined else candidate
+            judged.append((self._score(tube, path, shape, law, several), tube))
+        judged.sort(key=lambda pair: pair[0])
+        if self.refined:
+            for tried, (score, candidate) in enumerate(list(judged)):
+                close = tried < TRIES and score < CLOSE * judged[0][0]
+                enough = min(score for score, _ in judged) < GOOD_SCORE * (1 if tried < TRIES else 3)
+                hopeless = self.n_layers is None and tried >= TRIES and min(score for score, _ in judged) > HOPELESS
+                if tried and (enough or hopeless) and not close:
+                    break
+                better = candidate.widened(path, STEPS) if several else candidate.refined(path)
+                judged.append((self._score(better, path, shape, law, several), better))
+        found = min(judged, key=lambda pair: pair[0])[1]
+        notes: tuple[str, ...] = ()
+        if self.n_layers is None:
+            found, notes = self._followed(found, path, shape, law)
+        best = found.placed(origin, unit)
+        kappa = self.contraction or JUDGED
+        if several:
+            law, kappa, _ = self._settled(found, shape, law, several)
+        self._take(best, shown, law, kappa)
+        self._refuse_folds(shown)
+        details = self._conditioning(origin + unit * path, shown) | {
+            "isotopy": best.isotopy,
+            "spread": tuple(float(value) for value in strands.std(0).mean(0)),
+            "contraction": kappa,
+        }
+        return Learned(best.mse(origin + unit * path), self.diffeomorphism.n_layers, notes=notes, details=details)
 
     @torch.no_grad()
     def _take(self, candidate: Candidate, shown: Demonstration, law: PiecewiseLinearLaw, kappa: float = JUDGED) -> None:
@@ -320,7 +320,8 @@ class TubeDS(LatentDS):
         return frame.attractor + share.unsqueeze(-1) * frame.length * frame.axis
 
     @torch.no_grad()
-    def _report(self, best: Candidate, path: Array, shown: Demonstration, began: float) -> TubeReport:
+    def _conditioning(self, path: Array, shown: Demonstration) -> dict[str, float]:
+        """What the report tells of rollout error, conditioning, velocities and gradients: see :class:`TubeReport`."""
         line, frame = self._line(), self.frame()
         across = torch.linalg.svd(frame.axis.unsqueeze(-1))[0][:, 1:].T * TUBE * frame.length
         some = line[:: max(4, self.dim**2 // 16)]
@@ -331,17 +332,13 @@ class TubeDS(LatentDS):
         nudges = step * torch.eye(self.dim, dtype=y.dtype, device=y.device)
         slopes = (self(y.unsqueeze(-2) + nudges) - self(y.unsqueeze(-2) - nudges)) / (2 * step)
         length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-        return TubeReport(
-            mse=best.mse(path),
-            n_layers=self.diffeomorphism.n_layers,
-            seconds=time.perf_counter() - began,
-            isotopy=best.isotopy,
-            rollout_error=float(missed) / shown.size,
-            condition_path=float(self.condition_number(line).max()),
-            condition_tube=float(self.condition_number(tube).max()),
-            largest_velocity=float(torch.linalg.vector_norm(self(y), dim=-1).max()) * shown.duration / length,
-            largest_gradient=float(torch.linalg.matrix_norm(slopes, 2).max()) * shown.duration,
-        )
+        return {
+            "rollout_error": float(missed) / shown.size,
+            "condition_path": float(self.condition_number(line).max()),
+            "condition_tube": float(self.condition_number(tube).max()),
+            "largest_velocity": float(torch.linalg.vector_norm(self(y), dim=-1).max()) * shown.duration / length,
+            "largest_gradient": float(torch.linalg.matrix_norm(slopes, 2).max()) * shown.duration,
+        }
 
 
 class Several(NamedTuple):

@@ -46,8 +46,6 @@ class Case:
     shown: Demonstration
     learned: Demonstration
     """What ``ds`` was fitted to: ``shown``, in memory of its own."""
-    returned: object
-    """What fit returned."""
     changed: tuple[str, ...]
     """What global state the factory and fit changed."""
     probes: Tensor
@@ -62,7 +60,7 @@ class Case:
             shown, learned = wavy_motion(dim, seed), wavy_motion(dim, seed)
             ds, changed = seeded(lambda: factory(dim), seed)
             expect(isinstance(ds, StableDS), f"expected a StableDS, got {type(ds).__name__}")
-            returned, changed_by_fit = seeded(lambda: ds.fit(learned) if after_fit else None, seed)
+            _, changed_by_fit = seeded(lambda: ds.fit(learned) if after_fit else None, seed)
             goal = ds.attractor.detach().to(torch.float64)
             expect(goal.shape == (dim,), f"attractor: expected shape ({dim},), got {tuple(goal.shape)}")
         except Exception as error:
@@ -79,7 +77,7 @@ class Case:
         probes = torch.cat([on_path, on_path + spread(len(on_path), 0.1), goal + spread(8, 1), goal + spread(4, 10)])
         starts = torch.cat([path[:1], path[:1] + spread(2, 0.1), goal + spread(2, 10)])
         changes = (*changed, *changed_by_fit)
-        return cls(factory, seed, after_fit, ds, shown, learned, returned, changes, probes, starts)
+        return cls(factory, seed, after_fit, ds, shown, learned, changes, probes, starts)
 
     def __str__(self) -> str:
         return f"{type(self.ds).__name__} ({self.dim}-D, {state_of(self.after_fit)})"

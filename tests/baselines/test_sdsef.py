@@ -11,7 +11,7 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-import baselines.sdsef
+import baselines.flows
 from baselines import SDSEF
 from baselines.training import MAX_RECOVERIES, Plan, descend
 from latentds import Demonstration, datasets
@@ -128,7 +128,7 @@ def test_refit_forgets_and_an_interrupted_fit_changes_nothing(monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(baselines.sdsef, "descend", interrupted)
+        patch.setattr(baselines.flows, "descend", interrupted)
         with pytest.raises(KeyboardInterrupt):
             ds.fit(wavy_motion(3))
     assert torch.equal(ds(point), before)

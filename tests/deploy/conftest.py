@@ -36,7 +36,7 @@ class Field(LatentDS):
             self.attractor.normal_(generator=draw)
             self.start.copy_(self.attractor + 1)
 
-    def fit(self, demonstration, *, progress=False):
+    def _learn(self, shown, progress):
         raise NotImplementedError
 
 

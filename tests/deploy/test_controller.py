@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from baselines import FDM, SDSEF
-from latentds import ChebyshevDS, LatentDS, LocallyWeightedTranslations
+from latentds import ChebyshevDS, LatentDS, Learned, LocallyWeightedTranslations
 from latentds.dynamics import TubeDynamics
 from latentds.testing import wavy_motion
 from latentds.time_law import ChebyshevLaw, PiecewiseLinearLaw
@@ -25,12 +25,12 @@ class Tube(LatentDS):
         along = PiecewiseLinearLaw(torch.tensor([0.1, 0.4, 0.7, 1.0]), torch.tensor([0.2, 0.5, 0.3, 1.0]))
         super().__init__(dim, LocallyWeightedTranslations(dim, 30), TubeDynamics(along, ChebyshevLaw(0.2)))
 
-    def fit(self, demonstration, *, progress=False):
-        donor = ChebyshevDS(self.dim, n_layers=30, pinned=False).fit(demonstration)
+    def _learn(self, shown, progress):
+        donor = ChebyshevDS(self.dim, n_layers=30, pinned=False).fit(shown[0])
         self.diffeomorphism.load_state_dict(donor.diffeomorphism.state_dict())
-        self.attractor.copy_(demonstration.goal)
-        self.start.copy_(demonstration.start)
-        return self
+        self.attractor.copy_(shown[0].goal)
+        self.start.copy_(shown[0].start)
+        return Learned(0.0)
 
 
 class Scaled(ChebyshevDS):

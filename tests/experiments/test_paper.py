@@ -57,8 +57,8 @@ def test_sdsef_is_judged_where_it_was_not_trained(monkeypatch):
     shown = datasets.unstable_spiral(1, 100)
     ds = HeldOut(3, n_layers=2, n_features=8, epochs=2)
     trained = []
-    learn = ds.learner.fit
-    monkeypatch.setattr(ds.learner, "fit", lambda d, progress: (trained.append(d), learn(d))[1])
+    learn = ds.learner._learn
+    monkeypatch.setattr(ds.learner, "_learn", lambda some, progress: (trained.extend(some), learn(some, progress))[1])
     ds.fit(shown)
     assert len(trained[0]) == 70  # 30 of 98 between the ends are held out
     assert trained[0].duration == pytest.approx(shown.duration)
