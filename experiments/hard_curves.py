@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from experiments import report
 from latentds import Demonstration, FitWarning, TubeDS, datasets, metrics
-from latentds.demonstration import arc_lengths
+from latentds.curves import arc_lengths
 from latentds.methods.tube import TubeReport
 
 Array = NDArray[np.float64]
@@ -225,7 +225,7 @@ def row(curve: Curve) -> dict[str, Any]:
         "nearby": fit.fidelity.nearby,
         "follows": missed <= FOLLOWS,
         "seconds": seconds,
-        "isotopy": fit.isotopy,
+        "homotopy": fit.homotopy,
         "condition": fit.condition_path,
         "note": "; ".join(fit.notes),
     }

@@ -13,7 +13,8 @@ import torch
 from scipy.interpolate import CubicSpline
 
 from .arguments import number_in, whole_number
-from .demonstration import Demonstration, arc_lengths
+from .curves import arc_lengths, interpolated
+from .demonstration import Demonstration
 
 UNSTABLE_COMPLEXITIES = (1, 3, 7, 10, 15)
 STABLE_COMPLEXITIES = (1, 2, 3, 5, 7)
@@ -71,7 +72,7 @@ def stable_spiral(c: float, n_points: int = 1000, *, slowest: float = 1e-2) -> D
     path = path[: slow[0] + 1] if len(slow) else path
     times = np.arange(len(path)) * step
     even = np.linspace(0, times[-1], count)
-    positions = np.stack([np.interp(even, times, column) for column in path.T], axis=1)
+    positions = interpolated(even, np.asarray(times, np.float64), path)
     return Demonstration(torch.from_numpy(positions), float(even[1]), f"stable c={c:g}")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -13,11 +12,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from . import files, readers, recordings
-from .arguments import point_array, positive, real_array
+from .arguments import Array, point_array, positive, real_array
+from .curves import extent, interpolated
 
 logger = logging.getLogger(__name__)
 
@@ -102,12 +101,11 @@ class Demonstration:
     @property
     def size(self) -> float:
         """Largest extent along a coordinate axis, in the units of the positions."""
-        return float((self.positions.amax(0) - self.positions.amin(0)).max())
+        return extent(self.positions.numpy())
 
-    def at(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+    def at(self, times: Array) -> Array:
         """Positions at ``times`` (...), seconds, linear between the points and held beyond the ends: (..., n)."""
-        known = self.times.numpy()
-        return np.stack([np.interp(times, known, column) for column in self.positions.numpy().T], axis=-1)
+        return interpolated(times, self.times.numpy(), self.positions.numpy())
 
     @property
     def fingerprint(self) -> tuple[str, str]:
@@ -140,8 +138,9 @@ class Demonstration:
                 f"times: expected strictly increasing, got {stamps[row]:g} then {stamps[row + 1]:g} at row {row}"
             )
         even = np.linspace(stamps[0], stamps[-1], len(stamps))
-        resampled = np.stack([np.interp(even, stamps, column) for column in points.T], axis=1)
-        return cls(torch.from_numpy(resampled), float(even[-1] - even[0]) / (len(even) - 1), name)
+        return cls(
+            torch.from_numpy(interpolated(even, stamps, points)), float(even[-1] - even[0]) / (len(even) - 1), name
+        )
 
     @classmethod
     def load(
@@ -238,22 +237,6 @@ def demonstrations_of(demonstration: Any, dim: int) -> list[Demonstration]:
     if len(named) > 1:
         raise ValueError(f"demonstration: expected the same columns in all, got {named[0]} and {named[1]}")
     return list(found)
-
-
-def arc_lengths(positions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Length of the polygon through points (N, n) up to each of them, from 0: (N,)."""
-    lengths: NDArray[np.float64] = np.linalg.norm(np.diff(positions, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(lengths)])
-
-
-def jitter(positions: NDArray[np.float64], order: int = 2) -> float:
-    """Length of the noise in a recording (N, n), in the units of the positions.
-
-    Read off its differences of that order k, N > k, in which a motion like a polynomial of a lower degree does not
-    show: those of white noise of standard deviation s have s √C(2k, k).
-    """
-    differences = np.linalg.norm(np.diff(positions, order, axis=0), axis=1)
-    return float(np.median(differences)) / math.sqrt(math.comb(2 * order, order))
 
 
 def goal_apart(shown: Demonstration, goal: Tensor) -> float:

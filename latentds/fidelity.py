@@ -9,14 +9,12 @@ from typing import Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from .arguments import number_in, point_array, positive
-from .demonstration import Demonstration, jitter
+from .arguments import Array, number_in, point_array, positive
+from .curves import extent, jitter
+from .demonstration import Demonstration
 from .metrics import dtw, endpoint_error, path_length, path_length_ratio
-
-Array = NDArray[np.float64]
 
 MISS = 0.05
 """Largest mean distance from the demonstration, in its sizes; good fits stay below half of it, even of 1 % noise."""
@@ -207,12 +205,12 @@ def measure(ds: System, shown: Sequence[Excerpt]) -> Fidelity:
     ratios = [one["length_ratio"] for one in every]
     figures["length_ratio"] = max(ratios, key=lambda ratio: abs(math.log(ratio)) if ratio > 0 else math.inf)
     pairs = zip(paths, paths[1:] + paths[:1], strict=True) if len(paths) > 1 else ()
-    spread = [dtw(a, b) / max(len(a), len(b)) / _size(b) for a, b in pairs]
+    spread = [dtw(a, b) / max(len(a), len(b)) / extent(b) for a, b in pairs]
     return Fidelity(**figures, spread=float(np.mean(spread)) if spread else 0.0, shown=tuple(shown))
 
 
 def _measure(ds: System, one: Excerpt, path: Array, duration: float, around: Array, ball: Array) -> dict[str, float]:
-    size, count = _size(path), len(path)
+    size, count = extent(path), len(path)
     distance = np.linalg.norm(path - path[0], axis=1)
     away = np.argmax(distance > 2 * NEAR * size)
     near = min(NEAR * size, float(distance[away:].min()) / 4)
@@ -243,7 +241,3 @@ def restart_gap(ds: System, motion: Tensor, times: Tensor) -> float:
     middle = len(times) // 2
     anew = ds.rollout(motion[middle], times[middle:])
     return float(torch.linalg.vector_norm(anew - motion[middle:], dim=-1).max())
-
-
-def _size(path: Array) -> float:
-    return float(np.ptp(path, axis=0).max())

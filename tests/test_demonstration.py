@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from latentds import Demonstration
-from latentds.demonstration import arc_lengths, demonstrations_of, jitter, only_one
+from latentds.demonstration import demonstrations_of, only_one
 
 
 @pytest.fixture
@@ -292,25 +292,3 @@ def test_positions_at_any_time():
     shown = Demonstration([[0, 1], [2, 1], [2, 5.0]], 0.5)
     found = shown.at(np.array([[-1, 0.25], [0.5, 9]]))
     np.testing.assert_allclose(found, [[[0, 1], [1, 1]], [[2, 1], [2, 5]]])
-
-
-def test_arc_lengths_are_those_of_the_polygon():
-    points = np.random.default_rng(0).standard_normal((20, 3))
-    expected = [sum(math.dist(points[j], points[j + 1]) for j in range(i)) for i in range(20)]
-    np.testing.assert_allclose(arc_lengths(points), expected, rtol=1e-14)
-
-
-@pytest.mark.parametrize("order", [2, 4])
-@pytest.mark.parametrize("dim", [1, 3])
-def test_jitter_is_the_noise_and_none_of_the_motion(order, dim):
-    """A polynomial of a lower degree than the order does not show; noise does, as long as its median."""
-    draw = np.random.default_rng(0)
-    time, noise = np.linspace(0, 1, 4000)[:, None], 0.03 * draw.standard_normal((4000, dim))
-    motion = sum(draw.standard_normal(dim) * time**k for k in range(order))
-    assert jitter(motion, order) < 1e-12
-    assert jitter(motion + noise, order) == pytest.approx(np.median(np.linalg.norm(noise, axis=1)), rel=0.05)
-
-
-def test_jitter_reads_second_differences_unless_told():
-    positions = np.random.default_rng(0).standard_normal((9, 2))
-    assert jitter(positions) == jitter(positions, 2) != jitter(positions, 4)

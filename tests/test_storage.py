@@ -265,7 +265,7 @@ BAD = {
     "no report": (lambda p: written(p, report=...), "does not hold a system .* 'report'"),
     "another method's report": (
         lambda p: written(p, report=asdict(TubeReport(0.0, 1, 0.0))),
-        "report: expected the fields of FitReport, got unknown or missing ones: .'condition_path', .*'isotopy'",
+        "report: expected the fields of FitReport, got unknown or missing ones: .'condition_path', .*'homotopy'",
     ),
     "half a report": (
         lambda p: written(p, report={"mse": 0.0}),

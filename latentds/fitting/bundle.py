@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 from scipy.optimize import lsq_linear
 
+from ..arguments import Array
+from ..curves import directions_along, extent, step_lengths, transported_frames
 from .strands import Strands
-
-Array = NDArray[np.float64]
 
 WIDE = 0.2
 """Radius of the tube in sizes of the motion, where the path leaves room for it, …"""
@@ -51,17 +49,17 @@ def bundle(line: Array, path: Array, across: Array) -> Bundle:
     Args:
         line: evenly spaced.
         path: evenly spaced.
-        across: (n, n-1) the directions beside the line that :func:`frames` of the path belong to.
+        across: (n, n-1) the directions beside the line that the path's :func:`frames_across` belong to.
     """
     count, dim = path.shape
-    size, length = float(np.ptp(path, axis=0).max()), float(path_steps(path).sum())
+    size, length = extent(path), float(step_lengths(path).sum())
     axis = line[-1] - line[0]
     scale = float(np.linalg.norm(axis)) / length
     axis = axis / np.linalg.norm(axis)
     smooth = smoothed(path)
     reach = radius(path, smooth, WIDE * size)
     middle = path + (reach / (WIDE * size))[:, None] * (smooth - path)
-    sides = frames(smooth)
+    sides = frames_across(smooth)
     x, y = [line], [path]
     weights = [np.ones(count)]
     weights[0][[0, -1]] = 0.05 * count  # the start must encode to the start, the goal to the goal
@@ -94,16 +92,10 @@ def _free(points: Array, path: Array, away: Array) -> int:
     return len(points) if not len(blocked) else int(blocked[0]) // 2
 
 
-def path_steps(path: Array) -> Array:
-    """Lengths of the steps of a path, (N, n) -> (N-1,)."""
-    found: Array = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    return found
-
-
 def smoothed(path: Array) -> Array:
     """An evenly spaced path averaged over ``SMOOTH`` of its size, the ends kept: (N, n) -> (N, n)."""
-    step = float(path_steps(path).mean())
-    width = SMOOTH * float(np.ptp(path, axis=0).max()) / step
+    step = float(step_lengths(path).mean())
+    width = SMOOTH * extent(path) / step
     count = len(path)
     pad = min(count - 1, int(4 * width) + 1)
     before, after = 2 * path[0] - path[pad:0:-1], 2 * path[-1] - path[-2 : -2 - pad : -1]
@@ -115,7 +107,7 @@ def radius(path: Array, smooth: Array, wanted: float) -> Array:
     """How wide a tube around an evenly spaced path (N, n) may be at each point, at most ``wanted``: (N,)."""
     clearance = Strands(path).clearance(path)
     tangents = np.gradient(smooth, axis=0)
-    speeds = np.maximum(np.linalg.norm(tangents, axis=1), 1e-12 * np.ptp(path, axis=0).max())
+    speeds = np.maximum(np.linalg.norm(tangents, axis=1), 1e-12 * extent(path))
     bends = np.linalg.norm(np.gradient(tangents / speeds[:, None], axis=0), axis=1) / speeds
     most = np.minimum(ROOM * clearance, BEND / np.maximum(bends, 1e-12 / wanted))
     near = max(1, len(path) // 60)
@@ -124,35 +116,9 @@ def radius(path: Array, smooth: Array, wanted: float) -> Array:
     return found
 
 
-def directions_along(path: Array) -> Array:
-    """Unit tangents of a smooth path: (N, n) -> (N, n)."""
-    tangents = np.gradient(path, axis=0)
-    lengths = np.linalg.norm(tangents, axis=1, keepdims=True)
-    found: Array = tangents / np.maximum(lengths, 1e-12 * lengths.max())
-    return found
-
-
-def frames(path: Array) -> Array:
-    """Directions across a path, turned no more than it turns (Bishop 1975): (N, n) -> (N, n, n-1), orthonormal.
-
-    With the tangent first they are right-handed.
-    """
-    tangents = directions_along(path)
-    found = np.empty((*path.shape, path.shape[1] - 1))
-    found[0] = across_of(tangents[0])
-    for i, (before, after) in enumerate(pairwise(tangents)):
-        both = before + after
-        found[i + 1] = found[i] - np.outer(both, after @ found[i]) / max(1 + float(before @ after), 1e-9)
-    return found
-
-
-def across_of(direction: Array) -> Array:
-    """n-1 directions at right angles to one (n,), right-handed with it first: (n, n-1)."""
-    basis = np.linalg.qr(np.column_stack([direction, np.eye(len(direction))]))[0]
-    basis[:, 0] = direction
-    if len(direction) > 1 and np.linalg.det(basis) < 0:
-        basis[:, -1] *= -1
-    return basis[:, 1:]
+def frames_across(path: Array) -> Array:
+    """Directions across a smooth path that turn no more than it does: (N, n) -> (N, n, n-1), orthonormal."""
+    return transported_frames(directions_along(path))[0][:, :, 1:]
 
 
 def timing_of(progress: Array, times: Array) -> tuple[Array, Array]:

@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from ..arguments import whole_number
-from ..demonstration import arc_lengths, jitter
-
-Array = NDArray[np.float64]
+from ..arguments import Array, whole_number
+from ..curves import evenly_resampled, extent, jitter, progress_along
 
 
 def chebyshev_eigenvalues(n_points: int, dim: int) -> Array:
@@ -85,7 +82,7 @@ def arc_length_path(positions: Array, times: Array, n_points: int) -> tuple[Arra
         path (n_points, n) from start to goal; progress (m,), strictly decreasing from 1 to 0; its times (m,), strictly
         increasing from 0.
     """
-    size = float(np.ptp(positions, axis=0).max())
+    size = extent(positions)
     apart = float(np.clip(4 * jitter(positions), 5e-4 * size, 1e-2 * size))
     away = np.linalg.norm(positions - positions[-1], axis=1) > apart
     last = min(int(np.flatnonzero(away)[-1]) + 1, len(positions) - 1) if away.any() else len(positions) - 1
@@ -96,7 +93,4 @@ def arc_length_path(positions: Array, times: Array, n_points: int) -> tuple[Arra
     if len(kept) > 1 and np.linalg.norm(positions[-1] - positions[kept[-1]]) < apart / 2:
         kept.pop()
     points = np.concatenate([positions[kept], positions[-1:]])
-    arc = arc_lengths(points)
-    even = np.linspace(0, arc[-1], n_points)
-    path = np.stack([np.interp(even, arc, column) for column in points.T], axis=1)
-    return path, 1 - arc / arc[-1], times[[*kept, last]] - times[0]
+    return evenly_resampled(points, n_points), 1 - progress_along(points), times[[*kept, last]] - times[0]

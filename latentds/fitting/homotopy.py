@@ -5,12 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arguments import whole_number
-from .strands import progress_along
-
-Array = NDArray[np.float64]
+from ..arguments import Array, whole_number
+from ..curves import interpolated, laid_on, progress_along, step_lengths, transported_frames, turned
 
 
 def linear_homotopy(x: Array, y: Array, steps: int) -> Array:
@@ -31,15 +28,14 @@ def curvature_homotopy(y: Array, steps: int) -> Array:
     each curve is then laid rigidly on the next. Returns (K+1, N, n).
     """
     count = whole_number(steps, "steps", at_least=1)
-    segments = np.diff(y, axis=0)
-    lengths = np.linalg.norm(segments, axis=1)
-    turning = _turning(segments / lengths[:, None])
+    segments, lengths = np.diff(y, axis=0), step_lengths(y)
+    own, turning = transported_frames(segments / lengths[:, None])
     scaled = np.linspace(0, 1, count + 1)[:, None, None] * turning
-    frames = np.repeat(_frame(segments[0])[None], count + 1, axis=0)
+    frames = np.repeat(own[:1], count + 1, axis=0)
     tangents = np.empty((count + 1, len(segments), y.shape[1]))
     tangents[:, 0] = frames[:, :, 0]
     for i in range(len(turning)):
-        frames = _turned(frames, scaled[:, i])
+        frames = turned(frames, scaled[:, i])
         tangents[:, i + 1] = frames[:, :, 0]
     curves = np.concatenate(
         [np.zeros((count + 1, 1, y.shape[1])), np.cumsum(tangents * lengths[:, None], axis=1)], axis=1
@@ -54,10 +50,10 @@ def zoom_homotopy(y: Array, steps: int, pivot: float) -> Array:
     The part that is k/K of the curve on a logarithmic scale, from a fiftieth on; before it its chord. A part of a curve
     that does not cross itself does not either, so strands never meet on the way, of a knot neither.
     """
-    share, columns = progress_along(y), y.T
+    share = progress_along(y)
     parts = np.geomspace(0.02, 1, whole_number(steps, "steps", at_least=1) + 1)[:, None]
     at = pivot + parts * (share - pivot)
-    curves: Array = np.stack([np.interp(at, share, column) for column in columns], axis=-1) / parts[:, :, None]
+    curves = interpolated(at, share, y) / parts[:, :, None]
     curves[-1] = y
     chord = curves[0, :1] + share[:, None] * (curves[0, -1] - curves[0, 0])
     return _each_laid_on_the_next(np.concatenate([chord[None], curves]))
@@ -71,7 +67,7 @@ def clear_direction(y: Array, tries: int = 300, points: int = 120) -> tuple[Arra
     closer than they end, 0 if some meet.
     """
     chosen = np.linspace(0, len(y) - 1, min(points, len(y))).round().astype(int)
-    p, length = y[chosen], float(np.linalg.norm(np.diff(y, axis=0), axis=1).sum())
+    p, length = y[chosen], float(step_lengths(y).sum())
     axes = np.linalg.svd(p - p.mean(0), full_matrices=False)[2]
     random = np.random.default_rng(0).standard_normal((tries, y.shape[1]))
     directions = np.concatenate([p[-1:] - p[:1], axes, -axes, random])
@@ -102,52 +98,5 @@ def drawn_homotopy(y: Array, direction: Array, length: float, steps: int) -> Arr
 
 def _each_laid_on_the_next(curves: Array) -> Array:
     for k in range(len(curves) - 2, -1, -1):
-        curves[k] = _laid_on(curves[k], curves[k + 1])
+        curves[k] = laid_on(curves[k], curves[k + 1])
     return curves
-
-
-def _turning(tangents: Array) -> Array:
-    """Rotation vectors between successive unit tangents, in the transported normal frame: (m, n) -> (m-1, n-1)."""
-    frame = _frame(tangents[0])
-    turning = np.empty((len(tangents) - 1, tangents.shape[1] - 1))
-    for i, tangent in enumerate(tangents[1:]):
-        local = frame.T @ tangent
-        sine = np.linalg.norm(local[1:])
-        angle = np.arctan2(sine, local[0])
-        if sine > 1e-12:
-            turning[i] = angle / sine * local[1:]
-        else:  # straight on, or straight back: any normal will do
-            turning[i] = 0.0
-            turning[i, :1] = angle
-        frame = _turned(frame[None], turning[i][None])[0]
-    return turning
-
-
-def _frame(direction: Array) -> Array:
-    """An orthonormal basis (n, n) whose first column points along ``direction`` (n,)."""
-    frame: Array = np.linalg.svd(direction[:, None])[0]
-    frame[:, 0] *= np.sign(frame[:, 0] @ direction)
-    return frame
-
-
-def _turned(frames: Array, turning: Array) -> Array:
-    """Frames (k, n, n), columns tangent and normals, rotated by turning (k, n-1) in the plane of tangent and normal."""
-    angle = np.linalg.norm(turning, axis=1)
-    axis = turning / np.where(angle > 0, angle, 1.0)[:, None]
-    normal = np.einsum("kij,kj->ki", frames[:, :, 1:], axis)
-    tangent = frames[:, :, 0]
-    cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    turned: Array = frames.copy()
-    turned[:, :, 0] = cosine * tangent + sine * normal
-    change = (cosine - 1) * normal - sine * tangent
-    turned[:, :, 1:] += change[:, :, None] * axis[:, None, :]
-    return turned
-
-
-def _laid_on(curve: Array, other: Array) -> Array:
-    """The rigid motion of ``curve`` nearest to ``other``, both (N, n) (Kabsch)."""
-    centre, target = curve.mean(0), other.mean(0)
-    left, _, right = np.linalg.svd((curve - centre).T @ (other - target))
-    left[:, -1] *= np.sign(np.linalg.det(left @ right))
-    laid: Array = (curve - centre) @ left @ right + target
-    return laid

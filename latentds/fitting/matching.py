@@ -7,13 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from ..arguments import Array
 from ..diffeomorphism import WIDTH_BOUND, Layers, LocallyWeightedTranslations
 from ..kernels.greedy import greedy_kernel
 from .strands import Strands
-
-Array = NDArray[np.float64]
 
 
 def match(x: Array, y: Array, n_layers: int, beta: float, mu: float) -> Layers:
@@ -65,27 +63,31 @@ def match_along(curves: Array, n_layers: int, beta: float, mu: float, narrowest:
 
 STRIDE = 0.3
 """Longest step along a homotopy that :func:`track` takes, in clearances of each point."""
-ON_THE_WAY, AT_THE_END = 0.1, 0.02
+TRACK_TOLERANCE, FINAL_TOLERANCE = 0.1, 0.02
 """Distance from a curve of the homotopy, in clearances, at which :func:`track` goes on to a further one, and ends."""
-AT_ONCE = 10
+LAYERS_PER_LOOK = 10
 """Layers that it adds before it looks again."""
-STUCK = 1500
+GIVE_UP_AFTER = 1500
 """Layers after which it gives up a step."""
 
 
-def track(curves: Array, most: int, narrowest: float) -> Layers | None:
-    """Greedy matching of the first curve to the last of (K+1, N, n), as closely as strands need; None if it gets lost.
+def track(curves: Array, most: int, narrowest: float) -> tuple[Layers, bool]:
+    """Greedy matching of the first curve to the last of (K+1, N, n), as closely as strands need.
 
     From each curve the farthest one is aimed at that no point is more than ``STRIDE`` of its clearance away from, and
-    layers are added until every point is within ``ON_THE_WAY`` of it.
+    layers are added until every point is within ``TRACK_TOLERANCE`` of it.
 
     Args:
         curves: a homotopy in fine steps.
         most: layers.
         narrowest: least width 1/ρ of a layer, or the least clearance where that is less.
+
+    Returns:
+        The layers that were laid, and whether they arrive.
     """
     clearance, moved, at, last = Strands(curves[-1]).clearance, curves[0], 0, len(curves) - 1
-    parts: list[Layers] = []
+    nowhere = np.empty((0, curves.shape[2]))
+    parts = [Layers(nowhere, nowhere, np.empty(0))]
     here, used = clearance(curves[0]), 0
     while at < last:
         step, ahead, there = 1, at + 1, clearance(curves[at + 1])
@@ -96,23 +98,23 @@ def track(curves: Array, most: int, narrowest: float) -> Layers | None:
                 break
             step, there = 2 * step, farther
             ahead = at + step
-        began, allowed = used, (ON_THE_WAY if ahead < last else AT_THE_END) * there
+        began, allowed = used, (TRACK_TOLERANCE if ahead < last else FINAL_TOLERANCE) * there
         while ((missed := np.linalg.norm(moved - curves[ahead], axis=1)) > allowed).any():
-            if used - began >= STUCK or used >= most:
-                if ahead == last and (missed < ON_THE_WAY * there).all():
+            if used - began >= GIVE_UP_AFTER or used >= most:
+                if ahead == last and (missed < TRACK_TOLERANCE * there).all():
                     break
-                return None
+                return stacked(parts), False
             worst = int(np.argmax(missed / allowed))
             tight = missed[worst] < 0.5 * missed.max()  # where strands are close, though others are farther off
-            count, place = (1, worst) if tight else (AT_ONCE, -1)
+            count, place = (1, worst) if tight else (LAYERS_PER_LOOK, -1)
             width = min(narrowest, float(there.min()))
             layers, moved = add_greedy_layers(moved, curves[ahead], count, 0.9, 0.9, width, place)
             if not len(layers.widths):
-                return None
+                return stacked(parts), False
             parts.append(layers)
             used += len(layers.widths)
         at, here = ahead, there
-    return stacked(parts) if parts else None
+    return stacked(parts), used > 0
 
 
 PINS = 2

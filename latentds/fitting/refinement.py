@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from ..arguments import Array
 from ..diffeomorphism import WIDTH_BOUND, Layers, directions_of, strengths_of
 from ..kernels.translations import forward_and_adjoint
-
-Array = NDArray[np.float64]
 
 
 def refine(layers: Layers, x: Array, y: Array, mu: float, *, weights: Array | None = None, steps: int = 300) -> Layers:

@@ -7,24 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ..demonstration import arc_lengths
-
-Array = NDArray[np.float64]
-
-
-def segment_distances(gap: Array, step: Array, other: Array) -> Array:
-    """Distances (m,) of segments a + s step and b + t other with s, t in [0, 1] and gap = a - b, all (m, n).
-
-    Clamp one, solve for the other, clamp, solve back.
-    """
-    a, e = (step**2).sum(1), (other**2).sum(1)
-    b, c, f = (step * other).sum(1), (step * gap).sum(1), (other * gap).sum(1)
-    denominator = a * e - b * b
-    s = np.clip(np.where(denominator > 1e-12 * a * e, (b * f - c * e) / np.maximum(denominator, 1e-300), 0.0), 0, 1)
-    t = np.clip((b * s + f) / np.maximum(e, 1e-300), 0, 1)
-    s = np.clip((b * t - c) / np.maximum(a, 1e-300), 0, 1)
-    found: Array = np.linalg.norm(gap + s[:, None] * step - t[:, None] * other, axis=1)
-    return found
+from ..arguments import Array
+from ..curves import arc_lengths, interpolated, segment_distances, step_lengths
 
 
 class Strands:
@@ -44,7 +28,7 @@ class Strands:
         first, second = self.pairs[:, self.final | self._apart(curve)]
         corners = curve[self.chosen]
         step = np.diff(corners, axis=0)
-        nearest = np.full(len(corners), 0.1 * np.linalg.norm(step, axis=1).sum())
+        nearest = np.full(len(corners), 0.1 * step_lengths(corners).sum())
         if len(first):
             apart = segment_distances(corners[first] - corners[second], step[first], step[second])
             for ends in (first, first + 1, second, second + 1):
@@ -71,13 +55,6 @@ def crowded(curve: Array, most: int) -> Array:
     density = np.maximum(600 / arc[-1], 2 / np.maximum(Strands(curve, 600).clearance(curve), 1e-12))
     count = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2 * np.diff(arc))])
     even = np.interp(np.linspace(0, count[-1], min(most, math.ceil(count[-1]) + 1)), count, arc)
-    points: Array = np.stack([np.interp(even, arc, column) for column in curve.T], axis=1)
+    points = interpolated(even, arc, curve)
     points[[0, -1]] = curve[[0, -1]]
     return points
-
-
-def progress_along(curve: Array) -> Array:
-    """Share of the length of a curve (N, n) up to each of its points, 0 to 1: (N,)."""
-    arc = arc_lengths(curve)
-    share: Array = arc / arc[-1]
-    return share

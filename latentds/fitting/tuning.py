@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arguments import Array
 from .matching import add_greedy_layers
-
-Array = NDArray[np.float64]
 
 GOOD = 1e-5
 """The normalised MSE that the paper asks for."""

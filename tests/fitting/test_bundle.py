@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from latentds.fitting.bundle import across_of, bundle, directions_along, frames, radius, timing_of
+from latentds.curves import frame_along
+from latentds.fitting.bundle import bundle, radius, timing_of
 
 rng = np.random.default_rng
 
@@ -18,25 +19,11 @@ def arc(angle, dim=2, count=600):
     return np.stack([np.sin(turned), np.cos(turned), *np.zeros((dim - 2, count))], axis=1)
 
 
-@pytest.mark.parametrize("dim", [2, 3, 7])
-def test_frames_are_right_handed_and_across(dim):
-    path = np.cumsum(np.cumsum(rng(0).standard_normal((300, dim)), axis=0) + 40, axis=0)
-    found = np.concatenate([directions_along(path)[:, :, None], frames(path)], axis=2)
-    np.testing.assert_allclose(np.swapaxes(found, 1, 2) @ found, np.broadcast_to(np.eye(dim), found.shape), atol=1e-10)
-    np.testing.assert_allclose(np.linalg.det(found), 1, atol=1e-9)
-
-
-def test_frames_turn_no_more_than_the_path():
-    flat = frames(arc(3.0, 3))
-    assert np.ptp(flat[:, 2], axis=0).max() < 1e-12  # what stands upright on a flat curve stays upright
-    assert np.ptp(frames(straight(5)), axis=0).max() < 1e-12
-
-
 @pytest.mark.parametrize("dim", [1, 2, 3, 7])
 def test_a_straight_path_is_its_own_tube(dim):
     path = straight(dim)
     axis = path[-1] - path[0]
-    pairs = bundle(path, path, across_of(axis / np.linalg.norm(axis)))
+    pairs = bundle(path, path, frame_along(axis / np.linalg.norm(axis))[:, 1:])
     np.testing.assert_allclose(pairs.x, pairs.y, atol=1e-12)
     assert len(pairs.weights) == len(pairs.x) > len(path)
     assert (pairs.weights > 0).all()

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from latentds.fitting import homotopy
+from latentds.curves import laid_on
 from latentds.fitting.homotopy import curvature_homotopy, linear_homotopy
 from latentds.testing import wavy_motion
 
@@ -90,7 +90,7 @@ def test_each_curve_lies_rigidly_nearest_to_the_next(curve):
 def test_a_curve_is_laid_on_its_mirror_image_without_being_mirrored():
     t = np.linspace(0, 4, 50)[:, None]
     helix = np.hstack([np.cos(t), np.sin(t), 0.3 * t])
-    laid = homotopy._laid_on(helix, helix * [1, 1, -1])
+    laid = laid_on(helix, helix * [1, 1, -1])
 
     def handedness(curve):
         first, second, third = (np.diff(curve, k, axis=0)[:47] for k in (1, 2, 3))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from latentds.fitting.homotopy import clear_direction, drawn_homotopy, zoom_homotopy
-from latentds.fitting.strands import Strands, crowded, segment_distances
+from latentds.fitting.strands import Strands, crowded
 
 
 def circle(share=0.95, count=600):
@@ -17,18 +17,6 @@ def circle(share=0.95, count=600):
 def hairpin(gap, count=600):
     way = np.linspace(-1, 1, count)
     return np.stack([np.abs(way), gap * np.sign(way) / 2], 1)
-
-
-def test_distances_of_segments_are_those_of_their_points():
-    draw = np.random.default_rng(0)
-    start, step, other_start, other = draw.standard_normal((4, 50, 3))
-    share = np.linspace(0, 1, 201)
-    first = start[:, None] + share[:, None] * step[:, None]
-    second = other_start[:, None] + share[:, None] * other[:, None]
-    tried = np.linalg.norm(first[:, :, None] - second[:, None], axis=-1).min((1, 2))
-    found = segment_distances(start - other_start, step, other)
-    assert (found <= tried + 1e-12).all()
-    assert np.abs(found - tried).max() < 0.03
 
 
 def test_clearance_is_the_gap_of_a_hairpin_and_nothing_limits_a_line():

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 import re
+import time
+import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,9 +17,11 @@ from scipy.integrate import solve_ivp
 
 from latentds import Demonstration, FitWarning, datasets
 from latentds.dynamics import Frame, TubeDynamics
+from latentds.fitting import search
 from latentds.fitting.embedding import arc_length_path
+from latentds.fitting.search import _what_hides
 from latentds.methods import tube
-from latentds.methods.tube import TubeDS, _blur, mean_motion
+from latentds.methods.tube import TubeDS, mean_motion
 from latentds.metrics import dtw
 from latentds.testing import wavy_motion
 from latentds.time_law import PiecewiseLinearLaw
@@ -417,7 +423,7 @@ def test_units_and_origin_do_not_matter(scale, refined):
     start = shown.start + tensor([0.03, 0.05])
     moved = rolled(there, shown, scale * (start + shift)) / scale - shift
     assert (moved - rolled(here, shown, start)).norm(dim=-1).max() < 1e-9 * shown.size
-    assert here.fit_report.isotopy == there.fit_report.isotopy
+    assert here.fit_report.homotopy == there.fit_report.homotopy
 
 
 def test_a_slower_clock_slows_everything():
@@ -453,7 +459,7 @@ def test_report_agrees_with_autograd():
     length = float(shown.positions.diff(dim=0).norm(dim=-1).sum())
     assert report.largest_velocity >= on_path.norm(dim=-1).max() * shown.duration / length * 0.99
     assert report.largest_gradient >= 0.9 * slopes
-    assert report.isotopy in ("straight", "unbending")
+    assert report.homotopy in ("linear", "curvature")
     assert 0 <= report.rollout_error < 0.01
 
 
@@ -468,10 +474,10 @@ def test_rollout_error_is_the_distance_of_the_rollout(n_layers):
     assert ds.fit_report.rollout_error > 1e-7
 
 
-@pytest.mark.parametrize(("homotopy", "isotopy"), [("linear", "straight"), ("curvature", "unbending")])
-def test_one_homotopy_alone(homotopy, isotopy):
+@pytest.mark.parametrize("homotopy", ["linear", "curvature"])
+def test_one_homotopy_alone(homotopy):
     ds = TubeDS(2, n_layers=20, refined=False, homotopy=homotopy).fit(motion(lambda t: t))
-    assert ds.fit_report.isotopy == isotopy
+    assert ds.fit_report.homotopy == homotopy
     assert ds.settings["homotopy"] == homotopy
 
 
@@ -555,25 +561,44 @@ def test_what_hides_the_motion_is_told_with_its_size(spoil, told):
         shown = Demonstration(spoil(wave(), share), 0.01)
         # The noise of a point is the median length of three coordinates' noise; a step is one coordinate's.
         expected = share * 2 / shown.size * (1.54 if spoil is noisy else 1)
-        assert float(re.match(told, _blur(shown))[1]) == pytest.approx(expected, rel=0.1)
-    assert _blur(Demonstration(spoil(wave(), 0.005), 0.01)) == ""
-    assert _blur(Demonstration(wave(), 0.01)) == _blur(Demonstration(wave(9), 0.01)) == ""
+        assert float(re.match(told, _what_hides(shown, 0.02))[1]) == pytest.approx(expected, rel=0.1)
+    assert _what_hides(Demonstration(spoil(wave(), 0.005), 0.01), 0.02) == ""
+    assert _what_hides(Demonstration(wave(), 0.01), 0.02) == _what_hides(Demonstration(wave(9), 0.01), 0.02) == ""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("spoil", [noisy, in_steps])
 def test_a_fit_to_a_blurred_recording_says_so_and_searches_no_deeper(spoil, monkeypatch):
-    monkeypatch.setattr(tube, "_deeper", None)
+    monkeypatch.setattr(search.Search, "_deeper", None)
     shown = Demonstration(spoil(wave(), 0.05), 0.01)
     with pytest.warns(FitWarning) if spoil is noisy else contextlib.nullcontext():
         ds = TubeDS(3, refined=False).fit(shown)
-    assert ds.fit_report.notes[0] == _blur(shown) != ""
-    assert ds.fit_report.n_layers <= tube.DEPTHS[0]
+    assert ds.fit_report.notes[0] == _what_hides(shown, 0.02) != ""
+    assert ds.fit_report.n_layers <= search.PLAN.n_layers
 
 
-def test_a_search_that_runs_out_of_time_says_so(monkeypatch):
-    monkeypatch.setattr(tube, "SEARCH_SECONDS", 1e-3)
+def test_a_search_that_has_laid_its_layers_says_so(monkeypatch):
+    monkeypatch.setattr(tube, "PLAN", replace(search.PLAN, layer_budget=1))
     with pytest.warns(FitWarning):
         notes = TubeDS(2, refined=False).fit(planar_spiral(1.5)).fit_report.notes
     assert notes[0].startswith("no match tried follows the path closely; its strands come within ")
-    assert notes[1] == "the search for a match stopped after 0.001 s"
+    assert notes[1] == "the search for a match stopped after 1000 layers"
+
+
+def test_neither_a_clock_nor_threads_change_a_fit(monkeypatch):
+    """A motion that is searched deeper for: every clock leaps by an hour at each look, and two threads may be used."""
+    shown, leaps, threads = planar_spiral(1.5, 300), itertools.count(step=3600.0), torch.get_num_threads()
+    monkeypatch.setattr(tube, "PLAN", replace(search.PLAN, layer_budget=4000))
+    states = []
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", FitWarning)
+                states.append(TubeDS(2, refined=False).fit(shown).state_dict())
+            for name in ("time", "perf_counter", "monotonic", "process_time", "thread_time"):
+                monkeypatch.setattr(time, name, lambda: next(leaps))
+    finally:
+        torch.set_num_threads(threads)
+    assert states[0].keys() == states[1].keys()
+    assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
