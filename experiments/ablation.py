@@ -31,11 +31,11 @@ from experiments.motions import handwriting, recordings, spirals
 from experiments.published import TABLE_ONE
 from latentds import Demonstration, TubeDS, datasets
 from latentds.base import LatentDS
-from latentds.benchmark import Cell, Factory, Outcome, Protocol, run
+from latentds.benchmark import Cell, Factory, Outcome, RolloutProtocol, run
 from latentds.fitting.matching import PINS
 
-PROTOCOL = Protocol()
-MANY = Protocol(n_starts=200)
+PROTOCOL = RolloutProtocol()
+MANY = RolloutProtocol(n_starts=200)
 """On each spiral for TubeDS alone: over 20 starts a mean is still a matter of chance."""
 NEAR = 0.05
 """Radius of the ball of starts around a recording's start, in sizes of the motion; 0.1 on the spirals' sphere."""
@@ -57,7 +57,7 @@ class Part(NamedTuple):
     """Cells of one family that one protocol scores."""
 
     family: str
-    protocol: Protocol
+    protocol: RolloutProtocol
     cells: list[Cell]
 
 
@@ -105,10 +105,10 @@ def parts(
     layers = [(label, d) for d in shown for label in GREEDY if d.name in TABLE_ONE[label]]
     yield Part(LAYERS, PROTOCOL, [cell(label, half_the_layers(label, d.name), d) for label, d in layers])
     for d in recorded:
-        near = Protocol(n_starts=6, radius=NEAR * d.size)
+        near = RolloutProtocol(n_starts=6, radius=NEAR * d.size)
         yield Part("recordings", near, [cell(label, variants(d.name)[label], d) for label in CHOSEN])
     # Each is shown the first and judged by all, or shown six and judged by the seventh, from where those start.
-    theirs, seven = Protocol(n_starts=0), written.items()
+    theirs, seven = RolloutProtocol(n_starts=0), written.items()
     ones = [cell(label, variants(name)[label], d[0], d) for name, d in seven for label in CHOSEN]
     sixes = [cell(f"TubeDS without {i + 1}", TubeDS, d[:i] + d[i + 1 :], d[i]) for _, d in seven for i in (0, 3, 6)]
     if written:

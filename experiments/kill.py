@@ -20,10 +20,10 @@ import typer
 
 from baselines import FDM
 from latentds import ChebyshevDS, datasets
-from latentds.benchmark import Cell, Protocol, run
+from latentds.benchmark import Cell, RolloutProtocol, run
 from latentds.store import CellStore
 
-PROTOCOL = Protocol(n_starts=2, n_points=60)
+PROTOCOL = RolloutProtocol(n_starts=2, n_points=60)
 TIMES = ("fit_seconds", "rollout_seconds")
 
 

@@ -28,7 +28,7 @@ from experiments.motions import spirals
 from experiments.published import TABLE_ONE
 from latentds import Demonstration, plotting
 from latentds import report as page
-from latentds.benchmark import COLUMNS, Cell, Outcome, Protocol, run
+from latentds.benchmark import COLUMNS, Cell, Outcome, RolloutProtocol, run
 
 
 def main(
@@ -68,7 +68,7 @@ def main(
         seconds = time.perf_counter() - began
         settings = {
             "command": {"quick": quick, "jobs": jobs, "seeds": seeds, "seconds": round(seconds, 1)},
-            "protocol": asdict(Protocol()),
+            "protocol": asdict(RolloutProtocol()),
             "methods": {d.name: {m: f(d.dim).settings for m, f in methods(d.name, quick).items()} for d in shown},
         }
         summary = summarize(rows, [d.name for d in shown], list(methods(shown[0].name, quick)))

@@ -31,7 +31,7 @@ from typer.core import TyperGroup
 
 from . import fidelity, readers, storage
 from .base import FitReport, StableDS
-from .benchmark import Cell, Factory, Protocol, run
+from .benchmark import Cell, Factory, RolloutProtocol, run
 from .cell import interrupts_kept
 from .certificate import certify as certified
 from .datasets import joint_motion
@@ -433,7 +433,7 @@ def plot(
     if not shown:
         raise ValueError(NOT_FITTED)
     one = shown[0]
-    protocol = Protocol(starts, RADIUS * one.size if radius is None else radius)
+    protocol = RolloutProtocol(starts, RADIUS * one.size if radius is None else radius)
     begin = torch.cat([protocol.starts(one), *(d.start.unsqueeze(0) for d in shown[1:])])
     with torch.no_grad(), interrupts_kept():
         paths = ds.rollout(begin.to(ds.attractor), protocol.times(one)).double().numpy()
@@ -585,7 +585,7 @@ def compared(
     from .report import findings
 
     sizes = [one.size for item in shown for one in (item if isinstance(item, list) else [item])]
-    protocol = Protocol(starts, RADIUS * min(sizes) if radius is None else radius)
+    protocol = RolloutProtocol(starts, RADIUS * min(sizes) if radius is None else radius)
     cells = [
         Cell(label, make, item, seed, measure=findings)
         for item in shown

@@ -19,7 +19,7 @@ import torch
 from baselines import FDM, SDSEF
 from experiments import kill
 from latentds import ChebyshevDS, Demonstration, datasets, store
-from latentds.benchmark import Cell, Protocol, _key, compare, run
+from latentds.benchmark import Cell, RolloutProtocol, _key, compare, run
 from latentds.store import CellStore, UnreadableError, fingerprint
 
 SPIRAL = datasets.unstable_spiral(1, 60)
@@ -68,15 +68,15 @@ def test_a_second_run_computes_nothing_and_gives_the_same_rows(file):
 
 def test_paths_come_back(file):
     cells = [Cell("FDM", lambda dim: FDM(dim, n_layers=5), SPIRAL)]
-    (first,) = run(cells, Protocol(n_starts=1), n_jobs=1, store=file)
-    (again,) = run(cells, Protocol(n_starts=1), n_jobs=1, store=file)
+    (first,) = run(cells, RolloutProtocol(n_starts=1), n_jobs=1, store=file)
+    (again,) = run(cells, RolloutProtocol(n_starts=1), n_jobs=1, store=file)
     assert np.array_equal(first.paths, again.paths)
 
 
 def test_a_run_that_stops_keeps_what_it_has(file):
     methods = {str(i): (lambda dim, i=i: FDM(dim, n_layers=i)) for i in range(1, 7)}
     cells = [Cell(label, factory, SPIRAL) for label, factory in methods.items()]
-    outcomes = run(cells, Protocol(**{k: QUICK[k] for k in ("n_starts", "n_points")}), n_jobs=1, store=file)
+    outcomes = run(cells, RolloutProtocol(**{k: QUICK[k] for k in ("n_starts", "n_points")}), n_jobs=1, store=file)
     seen = {next(outcomes).method, next(outcomes).method}
     outcomes.close()
     with CellStore(file) as store:
@@ -100,7 +100,7 @@ def test_failures_are_tried_again(file):
     cells = [Cell("FDM", factory, SPIRAL), Cell("none", refuse, SPIRAL)]
 
     def status():
-        outcomes = run(cells, Protocol(n_starts=1, n_points=30), n_jobs=1, store=file)
+        outcomes = run(cells, RolloutProtocol(n_starts=1, n_points=30), n_jobs=1, store=file)
         return {outcome.method: [row["status"] for row in outcome.rows] for outcome in outcomes}
 
     assert status() == {"FDM": ["failed"] * 2, "none": ["failed"] * 2}
@@ -114,29 +114,29 @@ def test_everything_that_changes_a_result_changes_its_key():
     keys = [
         _key(cell, protocol)
         for cell, protocol in [
-            (base, Protocol()),
-            (Cell("other", base.factory, demonstration), Protocol()),
-            (Cell("m", lambda dim: SDSEF(dim, n_layers=3, n_features=10), demonstration), Protocol()),
+            (base, RolloutProtocol()),
+            (Cell("other", base.factory, demonstration), RolloutProtocol()),
+            (Cell("m", lambda dim: SDSEF(dim, n_layers=3, n_features=10), demonstration), RolloutProtocol()),
             (
                 Cell("m", lambda dim: SDSEF(dim, n_layers=2, n_features=10, recipe="official"), demonstration),
-                Protocol(),
+                RolloutProtocol(),
             ),
-            (Cell("m", lambda dim: SDSEF(dim, n_layers=2, n_features=10, seed=1), demonstration), Protocol()),
-            (Cell("m", lambda dim: FDM(dim), demonstration), Protocol()),
-            (Cell("m", lambda dim: FDM(dim, beta=0.4), demonstration), Protocol()),
-            (Cell("m", lambda dim: FDM(dim, mu=0.8), demonstration), Protocol()),
-            (Cell("m", base.factory, Demonstration(SPIRAL.positions + 1e-15, SPIRAL.dt, "a")), Protocol()),
-            (Cell("m", base.factory, Demonstration(SPIRAL.positions, 2 * SPIRAL.dt, "a")), Protocol()),
-            (Cell("m", base.factory, Demonstration(SPIRAL.positions, SPIRAL.dt, "b")), Protocol()),
-            (Cell("m", base.factory, demonstration, 1), Protocol()),
-            (base, Protocol(n_starts=19)),
-            (base, Protocol(radius=0.2)),
-            (base, Protocol(n_points=400)),
+            (Cell("m", lambda dim: SDSEF(dim, n_layers=2, n_features=10, seed=1), demonstration), RolloutProtocol()),
+            (Cell("m", lambda dim: FDM(dim), demonstration), RolloutProtocol()),
+            (Cell("m", lambda dim: FDM(dim, beta=0.4), demonstration), RolloutProtocol()),
+            (Cell("m", lambda dim: FDM(dim, mu=0.8), demonstration), RolloutProtocol()),
+            (Cell("m", base.factory, Demonstration(SPIRAL.positions + 1e-15, SPIRAL.dt, "a")), RolloutProtocol()),
+            (Cell("m", base.factory, Demonstration(SPIRAL.positions, 2 * SPIRAL.dt, "a")), RolloutProtocol()),
+            (Cell("m", base.factory, Demonstration(SPIRAL.positions, SPIRAL.dt, "b")), RolloutProtocol()),
+            (Cell("m", base.factory, demonstration, 1), RolloutProtocol()),
+            (base, RolloutProtocol(n_starts=19)),
+            (base, RolloutProtocol(radius=0.2)),
+            (base, RolloutProtocol(n_points=400)),
         ]
     ]
     assert len(set(keys)) == len(keys)
     same = Cell("m", lambda n: SDSEF(n, n_features=10, n_layers=2), Demonstration(SPIRAL.positions, SPIRAL.dt, "a"))
-    assert _key(same, Protocol()) == keys[0]
+    assert _key(same, RolloutProtocol()) == keys[0]
 
 
 class Slots:

@@ -8,7 +8,7 @@ import pytest
 
 from experiments import ablation, floor, goals
 from latentds import ChebyshevDS, Demonstration, TubeDS, datasets
-from latentds.benchmark import Protocol
+from latentds.benchmark import RolloutProtocol
 from latentds.testing import wavy_motion
 
 
@@ -17,7 +17,7 @@ def tube(n_layers):
 
 
 def part(*cells, protocol=None):
-    return ablation.Part("recordings", protocol or Protocol(n_starts=2), list(cells))
+    return ablation.Part("recordings", protocol or RolloutProtocol(n_starts=2), list(cells))
 
 
 def told(some, path):
@@ -28,14 +28,14 @@ def test_floor_of_an_even_straight_line():
     """Late by a share f of the step h, a point lies f h from one sample and (1-f) h from another: h/4 on average."""
     way = np.linspace(0, 2, 1000)
     shown = Demonstration(np.stack([way, 0 * way], 1), 0.01)
-    assert floor.sampled(shown, Protocol()) == pytest.approx(2 / 4, rel=0.01)
+    assert floor.sampled(shown, RolloutProtocol()) == pytest.approx(2 / 4, rel=0.01)
 
 
 def test_joining_a_straight_line():
     """Beside its start the offset dies at κ; behind it, m steps h late, m (m+1)/2 h are lost at either end."""
     way = np.linspace(0, 2, 500)
     shown, kappa = Demonstration(np.stack([way, 0 * way], 1), 0.01), 20.0
-    beside, behind = floor.joined(shown, Protocol(), np.array([[0, 0.1], [-5 * way[1], 0]]), kappa)
+    beside, behind = floor.joined(shown, RolloutProtocol(), np.array([[0, 0.1], [-5 * way[1], 0]]), kappa)
     assert beside == pytest.approx(0.1 * np.exp(-kappa * np.linspace(0, 1, 500)).sum(), rel=1e-3)
     assert behind == pytest.approx(5 * 6 * way[1], rel=1e-3)
 
