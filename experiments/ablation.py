@@ -31,7 +31,7 @@ from experiments.motions import handwriting, recordings, spirals
 from experiments.published import TABLE_ONE
 from latentds import Demonstration, TubeDS, datasets
 from latentds.base import LatentDS
-from latentds.benchmark import Cell, Factory, Outcome, RolloutProtocol, run
+from latentds.benchmark import Cell, Factory, Paths, RolloutProtocol, run, table
 from latentds.fitting.matching import PINS
 
 PROTOCOL = RolloutProtocol()
@@ -136,18 +136,14 @@ def costs(ds: LatentDS, cell: Cell) -> dict[str, Any]:
     return {"condition_path": condition, "attractor_exact": exact} | reported
 
 
-def results(part: Part, jobs: int, store: Path) -> list[tuple[Cell, Outcome]]:
-    """What came of each cell, in order; finished ones from the file that an earlier run left."""
+def results(part: Part, jobs: int, store: Path, paths: Paths) -> pd.DataFrame:
+    """The rows of its cells, with scores per point in sizes of the motion; finished cells come from the store."""
     outcomes = run(part.cells, part.protocol, n_jobs=jobs, progress=True, store=store)
-    found = {(o.method, o.demonstration, o.seed): o for o in outcomes}
-    return [(cell, found[cell.name]) for cell in part.cells]
-
-
-def told(part: Part, cell: Cell, outcome: Outcome) -> list[dict[str, Any]]:
-    """Its rows, with scores per point in sizes of the motion."""
-    shown, per_size = cell.shown[0], part.protocol.n_points * cell.shown[0].size
-    common = {"family": part.family, "dim": shown.dim, "size": shown.size}
-    return [row | common | {"share": row["dtw"] / per_size} for row in outcome.rows]
+    rows, shown = table(part.cells, outcomes, paths), {cell.name: cell.shown[0] for cell in part.cells}
+    motions = [shown[key] for key in zip(rows["method"], rows["demonstration"], rows["seed"], strict=True)]
+    size = np.array([motion.size for motion in motions])
+    share = rows["dtw"] / (part.protocol.n_points * size)
+    return rows.assign(family=part.family, dim=[motion.dim for motion in motions], size=size, share=share)
 
 
 def fit_seconds(refined: bool) -> float:
@@ -312,19 +308,19 @@ def main(
         console.print("LASA handwriting is not installed and left out: run `make lasa` once.")
     stand_ins = [datasets.joint_motion(seed) for seed in range(1 if quick else 3)]
     out.mkdir(parents=True, exist_ok=True)
-    found: list[dict[str, Any]] = []
-    shapes = {}
+    tables: list[pd.DataFrame] = []
+    shapes: dict[str, Any] = {}
     try:
         for part in parts(shown, recorded or stand_ins, written):
             console.print(f"{part.family}: {len(part.cells)} fits")
-            for cell, outcome in results(part, jobs, out / "cells.sqlite"):
-                found += told(part, cell, outcome)
-                if part.family == LASA and cell.method == "TubeDS":
-                    shapes[cell.demonstration] = (cell.judges, outcome.paths)
+            paths: Paths = {}
+            tables.append(results(part, jobs, out / "cells.sqlite", paths))
+            if part.family == LASA:
+                shapes |= {c.demonstration: (c.judges, paths[c.name]) for c in part.cells if c.method == "TubeDS"}
     except KeyboardInterrupt:
         console.print("Interrupted; the same command goes on from here.")
         raise typer.Exit(130) from None
-    rows = pd.DataFrame(found)
+    rows = pd.concat(tables, ignore_index=True)
     many = {d.name: floor.joined(d, MANY, MANY.starts(d)[1:].numpy()) for d in shown}
     best = {d.name: (floor.sampled(d, MANY), float(np.mean(many[d.name]))) for d in shown}
     summary = summarize(rows, best, {refined: fit_seconds(refined) for refined in (False, True)})
