@@ -21,7 +21,7 @@ import typer
 from baselines import FDM
 from latentds import ChebyshevDS, datasets
 from latentds.benchmark import Cell, RolloutProtocol, run
-from latentds.store import CellStore
+from latentds.cache import CellStore
 
 PROTOCOL = RolloutProtocol(n_starts=2, n_points=60)
 TIMES = ("fit_seconds", "rollout_seconds")

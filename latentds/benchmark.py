@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from .arguments import whole_number
+from .cache import CellStore, UnreadableError, fingerprint
 from .cell import (
     COLUMNS,
     Cell,
@@ -29,7 +30,6 @@ from .cell import (
     several,
 )
 from .demonstration import Demonstration
-from .store import CellStore, UnreadableError, fingerprint
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -86,10 +86,11 @@ def compare(
         n_jobs: processes, as joblib counts them. None: what ``joblib.parallel_config`` says around the call (that is
             how cells go to a Dask or Ray cluster, too), without it all local cores. Rows do not depend on it.
         progress: show a bar with method, demonstration and time left.
-        store: a file that keeps every finished cell (:class:`latentds.store.CellStore`), so that a run that was
+        store: a file that keeps every finished cell (:class:`latentds.cache.CellStore`), so that a run that was
             interrupted goes on where it stopped. A cell is known by its label, the method's settings and code, the
-            demonstrations and judges, the seed and the protocol: if one changes, it is computed anew. Failed cells are
-            not kept, nor are those of a method whose code or settings cannot be read; a warning names it.
+            demonstrations and judges, the seed and the protocol: if one changes, it is computed anew. What of the code
+            is seen, and what not, is said at :func:`latentds.cache.fingerprint`. Failed cells are not kept, nor are
+            those of a method whose code or settings cannot be read; a warning names it.
         paths: a mapping to put the rollouts into, {(method, demonstration, seed): (starts, n_points, n)}, for pictures
             and for :func:`latentds.report.write`.
         measure: what else the rows hold, in further columns: callable(fitted system, cell) -> mapping from names to

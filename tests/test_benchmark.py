@@ -16,8 +16,8 @@ from baselines import FDM
 from latentds import ChebyshevDS, Demonstration, StableDS, TubeDS, datasets, metrics
 from latentds.base import FitReport
 from latentds.benchmark import COLUMNS, Cell, RolloutProtocol, compare, evaluate, judge, run, table
+from latentds.cache import CellStore
 from latentds.fitting.matching import PINS
-from latentds.store import CellStore
 
 SPIRAL = datasets.unstable_spiral(1, 60)
 TIMES = ["fit_seconds", "rollout_seconds"]

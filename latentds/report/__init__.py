@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .. import plotting
-from ..benchmark import Cell
-from ..certificate import certify
 from ..demonstration import Demonstration
 from ..files import atomic_write
 from .comparison import Comparison
 from .drawn import drawn
+from .measured import findings
 from .verdict import percent, verdict
 
 try:
@@ -81,12 +80,6 @@ def write(
     )
     with atomic_write(path) as file:
         file.write(text.encode())
-
-
-def findings(ds: Any, cell: Cell) -> dict[str, str]:
-    """For :class:`~latentds.benchmark.Cell`'s ``measure``: the certificate as JSON, and the notes of the fit."""
-    notes = ds.fit_report.notes if ds.fit_report else ()
-    return {"certificate": certify(ds).to_json(), "notes": "; ".join(notes)}
 
 
 def environment() -> dict[str, Any]:
