@@ -36,8 +36,8 @@ def cells(n_seeds: int) -> list[Cell]:
 
 def work(store: str | None, jobs: int, n_seeds: int) -> list[tuple]:
     """The run that is killed. Returns its rows without their times, sorted."""
-    found = [row for outcome in run(cells(n_seeds), PROTOCOL, n_jobs=jobs, store=store) for row in outcome.rows]
-    return sorted(tuple((name, value) for name, value in row.items() if name not in TIMES) for row in found)
+    rows = [row for outcome in run(cells(n_seeds), PROTOCOL, n_jobs=jobs, store=store) for row in outcome.rows]
+    return sorted(tuple((name, value) for name, value in row.items() if name not in TIMES) for row in rows)
 
 
 def main(

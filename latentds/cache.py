@@ -132,14 +132,14 @@ def fingerprint(*things: Any) -> str:
         UnreadableError: for what a pickle cannot hold, such as a lock, a generator, or a compiled function without a
             name.
     """
-    reader = _Reader({f"{__package__}.cell"})
+    pickler = _KeyPickler({f"{__package__}.cell"})
     try:
-        reader.dump(things)
-        reader.dump([platform.python_version(), *_sources(reader.modules)])
+        pickler.dump(things)
+        pickler.dump([platform.python_version(), *_sources(pickler.modules)])
     except Exception as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise UnreadableError(f"expected settings and code that a pickle can hold, got {reason}") from None
-    return hashlib.sha256(reader.stream.getvalue()).hexdigest()
+    return hashlib.sha256(pickler.stream.getvalue()).hexdigest()
 
 
 _NAMED = {"torch", "numpy", "scipy", "numba", *sys.stdlib_module_names}
@@ -164,7 +164,7 @@ _PARTS: dict[type, Any] = {
 """What stands for objects that are not pickled, or not by value."""
 
 
-class _Reader(pickle._Pickler):
+class _KeyPickler(pickle._Pickler):
     """A pickler for hashing: classes and functions go in by value, and equal things give equal bytes.
 
     Attributes:
@@ -202,9 +202,9 @@ class _Reader(pickle._Pickler):
         return NotImplemented if content is None else (object, (kind.__qualname__,), content)
 
     def _apart(self, item: Any) -> bytes:
-        reader = _Reader(self.modules)
-        reader.dump(item)
-        return reader.stream.getvalue()
+        pickler = _KeyPickler(self.modules)
+        pickler.dump(item)
+        return pickler.stream.getvalue()
 
     def _class(self, kind: type) -> list[Any] | None:
         if kind is object:

@@ -257,9 +257,9 @@ def test_what_torch_does_to_its_own_classes_is_not_the_methods(monkeypatch):
 
 def counted(thing):
     """The modules whose files are in a thing's key."""
-    reader = cache._Reader({"latentds.cell"})
-    reader.dump(thing)
-    return {name for name, _ in cache._sources(reader.modules)[0]}
+    pickler = cache._KeyPickler({"latentds.cell"})
+    pickler.dump(thing)
+    return {name for name, _ in cache._sources(pickler.modules)[0]}
 
 
 def test_files_that_a_fit_can_reach_count_and_no_others():

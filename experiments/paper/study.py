@@ -105,5 +105,5 @@ def rows(outcomes: Iterable[Outcome]) -> pd.DataFrame:
 
 def paths(outcomes: Iterable[Outcome], name: str, methods: Iterable[str]) -> dict[str, NDArray[np.float64]]:
     """{method: its rollouts} on the motion of that name."""
-    found = {o.method: o.paths for o in outcomes if o.demonstration == name}
-    return {method: found[method] for method in methods}
+    moved = {o.method: o.paths for o in outcomes if o.demonstration == name}
+    return {method: moved[method] for method in methods}
