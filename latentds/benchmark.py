@@ -16,19 +16,7 @@ from torch import nn
 
 from .arguments import whole_number
 from .cache import CellStore, UnreadableError, fingerprint
-from .cell import (
-    COLUMNS,
-    Cell,
-    Factory,
-    Measure,
-    Outcome,
-    RolloutProtocol,
-    build,
-    evaluate,
-    judge,
-    reproducible_torch,
-    several,
-)
+from .cell import COLUMNS, Cell, Factory, Outcome, RolloutProtocol, build, evaluate, reproducible_torch, several
 from .demonstration import Demonstration
 
 if TYPE_CHECKING:
@@ -37,19 +25,7 @@ if TYPE_CHECKING:
 Paths = MutableMapping[tuple[str, str, int], NDArray[np.float64]]
 """{(method, demonstration, seed): rollouts (starts, n_points, n)}."""
 
-__all__ = [
-    "COLUMNS",
-    "Cell",
-    "Factory",
-    "Outcome",
-    "Paths",
-    "RolloutProtocol",
-    "compare",
-    "evaluate",
-    "judge",
-    "run",
-    "table",
-]
+__all__ = ["COLUMNS", "Cell", "Factory", "Outcome", "Paths", "RolloutProtocol", "compare", "evaluate", "run", "table"]
 
 
 def compare(
@@ -65,7 +41,7 @@ def compare(
     progress: bool = False,
     store: str | os.PathLike[str] | None = None,
     paths: Paths | None = None,
-    measure: Measure | None = None,
+    measure: Callable[[Any, Cell], Mapping[str, Any]] | None = None,
 ) -> pd.DataFrame:
     """Fit every method to every demonstration with every seed, roll each out from shared starts, and score it.
 
@@ -140,7 +116,7 @@ def table(cells: Sequence[Cell], outcomes: Iterable[Outcome], paths: Paths | Non
 
     Args:
         cells: those that were run.
-        outcomes: of :func:`run` or :func:`judge`; of some cells only, if a run was interrupted.
+        outcomes: of :func:`run` or :func:`latentds.cell.judge`; of some cells only, if a run was interrupted.
         paths: a mapping to put the rollouts into, as for :func:`compare`.
     """
     pandas = _studies("pandas")

@@ -260,7 +260,7 @@ def _outcome(
     rows = [
         {"method": cell.method, "demonstration": cell.demonstration, "seed": cell.seed, "start": share * i + k}
         | {
-            "status": _status(reason, path),
+            "status": "failed" if error else "ok" if np.isfinite(path).all() else "diverged",
             "error": reason,
             "follows": follows,
             "converged": converged is not None and bool(converged[i, k]),
@@ -323,10 +323,6 @@ def _converged(ds: StableDS, judge: Demonstration, starts: Tensor) -> NDArray[np
     missed = torch.linalg.vector_norm(ds.attractor - judge.goal)
     arrived = (left <= CONVERGED_WITHIN * judge.size) & (missed <= ON_GOAL * judge.size)
     return np.asarray(arrived.numpy())
-
-
-def _status(error: str, path: NDArray[np.float64]) -> str:
-    return "failed" if error else "ok" if np.isfinite(path).all() else "diverged"
 
 
 _RNG_LOCK = threading.RLock()

@@ -15,8 +15,9 @@ from scipy import stats
 from baselines import FDM
 from latentds import ChebyshevDS, Demonstration, StableDS, TubeDS, datasets, metrics
 from latentds.base import FitReport
-from latentds.benchmark import COLUMNS, Cell, RolloutProtocol, compare, evaluate, judge, run, table
+from latentds.benchmark import COLUMNS, Cell, RolloutProtocol, compare, evaluate, run, table
 from latentds.cache import CellStore
+from latentds.cell import judge
 from latentds.fitting.matching import PINS
 
 SPIRAL = datasets.unstable_spiral(1, 60)
