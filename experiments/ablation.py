@@ -31,11 +31,11 @@ from experiments.motions import handwriting, recordings, spirals
 from experiments.published import TABLE_ONE
 from latentds import Demonstration, TubeDS, datasets
 from latentds.base import LatentDS
-from latentds.benchmark import Cell, Factory, Outcome, Protocol, run
+from latentds.benchmark import Cell, Factory, Paths, RolloutProtocol, run, table
 from latentds.fitting.matching import PINS
 
-PROTOCOL = Protocol()
-MANY = Protocol(n_starts=200)
+PROTOCOL = RolloutProtocol()
+MANY = RolloutProtocol(n_starts=200)
 """On each spiral for TubeDS alone: over 20 starts a mean is still a matter of chance."""
 NEAR = 0.05
 """Radius of the ball of starts around a recording's start, in sizes of the motion; 0.1 on the spirals' sphere."""
@@ -57,29 +57,29 @@ class Part(NamedTuple):
     """Cells of one family that one protocol scores."""
 
     family: str
-    protocol: Protocol
+    protocol: RolloutProtocol
     cells: list[Cell]
 
 
 def variants(name: str) -> dict[str, Factory]:
     """{label: factory} for the motion of that name."""
-    found: dict[str, Factory] = {}
+    tried: dict[str, Factory] = {}
     for label in GREEDY:
         chosen = setting(label, name)
         steps = steps_for(chosen.n_layers)
-        found |= {
+        tried |= {
             f"{label}, ends not pinned": greedy(label, chosen, pinned=False),
             label: greedy(label, chosen),
             f"{label} + continuation": greedy(label, chosen, steps=steps),
             f"{label} + refinement": greedy(label, chosen, refined=True),
             f"{label} + both": greedy(label, chosen, steps=steps, refined=True),
         }
-    found["TubeDS, straight alone"] = partial(TubeDS, homotopy="linear")
-    found["TubeDS, unbending alone"] = partial(TubeDS, homotopy="curvature")
-    found["TubeDS, not refined"] = partial(TubeDS, refined=False)
+    tried["TubeDS, straight alone"] = partial(TubeDS, homotopy="linear")
+    tried["TubeDS, unbending alone"] = partial(TubeDS, homotopy="curvature")
+    tried["TubeDS, not refined"] = partial(TubeDS, refined=False)
     for kappa in KAPPAS:
-        found[f"TubeDS, not refined, κ = {kappa:g}"] = partial(TubeDS, contraction=kappa, refined=False)
-    return found | {"TubeDS": TubeDS}
+        tried[f"TubeDS, not refined, κ = {kappa:g}"] = partial(TubeDS, contraction=kappa, refined=False)
+    return tried | {"TubeDS": TubeDS}
 
 
 def steps_for(n_layers: int) -> int:
@@ -105,10 +105,10 @@ def parts(
     layers = [(label, d) for d in shown for label in GREEDY if d.name in TABLE_ONE[label]]
     yield Part(LAYERS, PROTOCOL, [cell(label, half_the_layers(label, d.name), d) for label, d in layers])
     for d in recorded:
-        near = Protocol(n_starts=6, radius=NEAR * d.size)
+        near = RolloutProtocol(n_starts=6, radius=NEAR * d.size)
         yield Part("recordings", near, [cell(label, variants(d.name)[label], d) for label in CHOSEN])
     # Each is shown the first and judged by all, or shown six and judged by the seventh, from where those start.
-    theirs, seven = Protocol(n_starts=0), written.items()
+    theirs, seven = RolloutProtocol(n_starts=0), written.items()
     ones = [cell(label, variants(name)[label], d[0], d) for name, d in seven for label in CHOSEN]
     sixes = [cell(f"TubeDS without {i + 1}", TubeDS, d[:i] + d[i + 1 :], d[i]) for _, d in seven for i in (0, 3, 6)]
     if written:
@@ -136,18 +136,14 @@ def costs(ds: LatentDS, cell: Cell) -> dict[str, Any]:
     return {"condition_path": condition, "attractor_exact": exact} | reported
 
 
-def results(part: Part, jobs: int, store: Path) -> list[tuple[Cell, Outcome]]:
-    """What came of each cell, in order; finished ones from the file that an earlier run left."""
+def results(part: Part, jobs: int, store: Path, paths: Paths) -> pd.DataFrame:
+    """The rows of its cells, with scores per point in sizes of the motion; finished cells come from the store."""
     outcomes = run(part.cells, part.protocol, n_jobs=jobs, progress=True, store=store)
-    found = {(o.method, o.demonstration, o.seed): o for o in outcomes}
-    return [(cell, found[cell.name]) for cell in part.cells]
-
-
-def told(part: Part, cell: Cell, outcome: Outcome) -> list[dict[str, Any]]:
-    """Its rows, with scores per point in sizes of the motion."""
-    shown, per_size = cell.shown[0], part.protocol.n_points * cell.shown[0].size
-    common = {"family": part.family, "dim": shown.dim, "size": shown.size}
-    return [row | common | {"share": row["dtw"] / per_size} for row in outcome.rows]
+    rows, shown = table(part.cells, outcomes, paths), {cell.name: cell.shown[0] for cell in part.cells}
+    motions = [shown[key] for key in zip(rows["method"], rows["demonstration"], rows["seed"], strict=True)]
+    size = np.array([motion.size for motion in motions])
+    share = rows["dtw"] / (part.protocol.n_points * size)
+    return rows.assign(family=part.family, dim=[motion.dim for motion in motions], size=size, share=share)
 
 
 def fit_seconds(refined: bool) -> float:
@@ -174,7 +170,7 @@ def judge(rows: pd.DataFrame, seconds: dict[bool, float]) -> list[Goal]:
     drawn, joints = first[first["family"] == LASA], first[(first["family"] == "recordings") & (first["dim"] == 7)]
     six = rows[rows["family"] == SIX]["share"]
     low, exact = gain[~(gain >= 3)], bool(first["attractor_exact"].eq(True).all())
-    found = [
+    reached = [
         at_most("spirals: exact DTW from the demonstrated start", first.loc[list(near.groups), "dtw"], 3),
         at_most("spirals: mean exact DTW over 20 starts", near.mean(), 8),
         at_most("spirals: largest exact DTW over 20 starts", near.max(), 20),
@@ -193,29 +189,29 @@ def judge(rows: pd.DataFrame, seconds: dict[bool, float]) -> list[Goal]:
     ]
     for refined, bound in ((False, 1), (True, 10)):
         name = f"fit of 150 layers to 1000 points, refinement {'on' if refined else 'off'}"
-        found.append(at_most(name, pd.Series({"": seconds[refined]}), bound, " s"))
-    return found
+        reached.append(at_most(name, pd.Series({"": seconds[refined]}), bound, " s"))
+    return reached
 
 
 def layer_goals(rows: pd.DataFrame) -> list[Goal]:
-    found = []
+    listed = []
     for _, row in rows[(rows["family"] == LAYERS) & (rows["start"] == 0)].iterrows():
         name, label, reached = row["demonstration"], row["method"], row["mse"]
         paper = TABLE_ONE[label][name]
         hoped = name in ("unstable c=7", "unstable c=10", "unstable c=15")
         what = f"{label} + both, {name}: MSE with {paper.n_layers // 2} of the paper's {paper.n_layers} layers"
         goal = f"≤ {paper.mse:.2e}" if hoped else f"(paper {paper.mse:.2e})"
-        found.append(Goal(what, goal, f"{reached:.2e}", met=bool(reached <= paper.mse) if hoped else None))
-    return found
+        listed.append(Goal(what, goal, f"{reached:.2e}", met=bool(reached <= paper.mse) if hoped else None))
+    return listed
 
 
 def summarize(rows: pd.DataFrame, best: dict[str, tuple[float, float]], seconds: dict[bool, float]) -> str:
     parts = ["# The ideas on and off", "## Must reach", goals.table(judge(rows, seconds))]
     for family in FAMILIES:
-        if not (found := rows[rows["family"] == family]).empty:
+        if not (members := rows[rows["family"] == family]).empty:
             unit = "exact DTW" if family in ("unstable", "stable") else "DTW/500 in sizes of the motion"
-            count = found["demonstration"].nunique()
-            parts += [f"## {family.capitalize() if family != LASA else LASA}: {unit}, {count} motions", ideas(found)]
+            count = members["demonstration"].nunique()
+            parts += [f"## {family.capitalize() if family != LASA else LASA}: {unit}, {count} motions", ideas(members)]
     parts += ["## TubeDS on each spiral: exact DTW", each_spiral(rows, best), FLOOR]
     parts += ["## What the contraction κ costs and buys", contraction(rows)]
     if (rows["family"] == SIX).any():
@@ -240,9 +236,9 @@ def ideas(rows: pd.DataFrame) -> str:
     """A line per method: mean and worst from the demonstrated start and from the others."""
     score, digits = ("dtw", ".2f") if rows["family"].iloc[0] in ("unstable", "stable") else ("share", ".4f")
     lines = []
-    for label, found in rows.groupby("method", sort=False):
-        at, off = found[found["start"] == 0], found[found["start"] > 0]
-        lost = int((found["status"] != "ok").sum())
+    for label, mine in rows.groupby("method", sort=False):
+        at, off = mine[mine["start"] == 0], mine[mine["start"] > 0]
+        lost = int((mine["status"] != "ok").sum())
         numbers = [format(f(part[score]), digits) for part in (at, off) for f in (pd.Series.mean, pd.Series.max)]
         costs = [f"{at['condition_path'].max():.2g}", f"{at['fit_seconds'].median():.2f}"]
         lines.append([str(label), *numbers, *costs, str(lost or "")])
@@ -254,7 +250,7 @@ def each_spiral(rows: pd.DataFrame, best: dict[str, tuple[float, float]]) -> str
     lines = []
     for name, (least, tube_alone) in best.items():
         of = rows[(rows["demonstration"] == name) & (rows["family"] != LAYERS)]
-        dtw = {label: found.set_index("start")["dtw"] for label, found in of.groupby("method")}
+        dtw = {label: mine.set_index("start")["dtw"] for label, mine in of.groupby("method")}
         twenty, many = dtw["TubeDS"].drop(0), dtw[f"TubeDS, {MANY.n_starts} starts"].drop(0)
         rivals = [dtw[label].drop(0).mean() for label in GREEDY]
         numbers = [dtw["TubeDS"][0], twenty.mean(), twenty.max(), many.mean(), many.max(), tube_alone, least, *rivals]
@@ -270,10 +266,10 @@ def contraction(rows: pd.DataFrame) -> str:
     for family in ("unstable", "stable"):
         for kappa in sorted((*KAPPAS, 20.0)):
             label = "TubeDS, not refined" + (f", κ = {kappa:g}" if kappa in KAPPAS else "")
-            found = rows[(rows["family"] == family) & (rows["method"] == label)]
-            if found.empty:
+            mine = rows[(rows["family"] == family) & (rows["method"] == label)]
+            if mine.empty:
                 continue
-            off, each = found[found["start"] > 0]["share"], found[found["start"] == 0]
+            off, each = mine[mine["start"] > 0]["share"], mine[mine["start"] == 0]
             fast, steep = each["largest_velocity"].median(), each["largest_gradient"].median()
             lines.append([family, f"{kappa:g}", f"{off.mean():.4f}", f"{off.max():.4f}", f"{fast:.1f}", f"{steep:.0f}"])
     head = ("motions", "κ", "other starts, mean", "worst", "largest velocity", "largest gradient")
@@ -283,10 +279,10 @@ def contraction(rows: pd.DataFrame) -> str:
 def each_shape(rows: pd.DataFrame) -> str:
     one, six = rows[(rows["family"] == LASA) & (rows["method"] == "TubeDS")], rows[rows["family"] == SIX]
     lines = []
-    for name, found in one.groupby("demonstration", sort=False):
-        at = found[found["start"] == 0].iloc[0]
+    for name, scored in one.groupby("demonstration", sort=False):
+        at = scored[scored["start"] == 0].iloc[0]
         seventh = six[six["demonstration"] == name]["share"]
-        numbers = [at["share"], found[found["start"] > 0]["share"].mean(), seventh.mean(), seventh.max()]
+        numbers = [at["share"], scored[scored["start"] > 0]["share"].mean(), seventh.mean(), seventh.max()]
         lines.append([str(name), *(f"{x:.4f}" for x in numbers), f"{at['condition_path']:.3g}", at["isotopy"]])
     at, off = one[one["start"] == 0]["share"], one[one["start"] > 0]["share"]
     means = [f"{x:.4f}" for x in (at.mean(), off.mean(), six["share"].mean(), six["share"].max())]
@@ -312,19 +308,19 @@ def main(
         console.print("LASA handwriting is not installed and left out: run `make lasa` once.")
     stand_ins = [datasets.joint_motion(seed) for seed in range(1 if quick else 3)]
     out.mkdir(parents=True, exist_ok=True)
-    found: list[dict[str, Any]] = []
-    shapes = {}
+    tables: list[pd.DataFrame] = []
+    shapes: dict[str, Any] = {}
     try:
         for part in parts(shown, recorded or stand_ins, written):
             console.print(f"{part.family}: {len(part.cells)} fits")
-            for cell, outcome in results(part, jobs, out / "cells.sqlite"):
-                found += told(part, cell, outcome)
-                if part.family == LASA and cell.method == "TubeDS":
-                    shapes[cell.demonstration] = (cell.judges, outcome.paths)
+            paths: Paths = {}
+            tables.append(results(part, jobs, out / "cells.sqlite", paths))
+            if part.family == LASA:
+                shapes |= {c.demonstration: (c.judges, paths[c.name]) for c in part.cells if c.method == "TubeDS"}
     except KeyboardInterrupt:
         console.print("Interrupted; the same command goes on from here.")
         raise typer.Exit(130) from None
-    rows = pd.DataFrame(found)
+    rows = pd.concat(tables, ignore_index=True)
     many = {d.name: floor.joined(d, MANY, MANY.starts(d)[1:].numpy()) for d in shown}
     best = {d.name: (floor.sampled(d, MANY), float(np.mean(many[d.name]))) for d in shown}
     summary = summarize(rows, best, {refined: fit_seconds(refined) for refined in (False, True)})

@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from latentds import Demonstration, metrics
-from latentds.benchmark import Protocol
+from latentds.benchmark import RolloutProtocol
 
 Array = NDArray[np.float64]
 
 
-def sampled(shown: Demonstration, protocol: Protocol, count: int = 100) -> float:
+def sampled(shown: Demonstration, protocol: RolloutProtocol, count: int = 100) -> float:
     """Mean exact DTW between the sampled demonstration and itself, late by a fraction of a sample, even over [0, 1).
 
     Off the demonstrated start nobody knows the clock: even a perfect rollout is late by some such fraction.
@@ -21,7 +21,7 @@ def sampled(shown: Demonstration, protocol: Protocol, count: int = 100) -> float
     return float(np.mean([metrics.dtw(shown.at(times + seconds), reference) for seconds in late]))
 
 
-def joined(shown: Demonstration, protocol: Protocol, starts: Array, kappa: float = 20.0) -> list[float]:
+def joined(shown: Demonstration, protocol: RolloutProtocol, starts: Array, kappa: float = 20.0) -> list[float]:
     """Exact DTW of the demonstration itself, joined from each start (n,) at its nearest point.
 
     The way there shrinks at ``kappa``, as in a tube without any error; a start behind the first point is late.

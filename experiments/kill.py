@@ -20,10 +20,10 @@ import typer
 
 from baselines import FDM
 from latentds import ChebyshevDS, datasets
-from latentds.benchmark import Cell, Protocol, run
-from latentds.store import CellStore
+from latentds.benchmark import Cell, RolloutProtocol, run
+from latentds.cache import CellStore
 
-PROTOCOL = Protocol(n_starts=2, n_points=60)
+PROTOCOL = RolloutProtocol(n_starts=2, n_points=60)
 TIMES = ("fit_seconds", "rollout_seconds")
 
 
@@ -36,8 +36,8 @@ def cells(n_seeds: int) -> list[Cell]:
 
 def work(store: str | None, jobs: int, n_seeds: int) -> list[tuple]:
     """The run that is killed. Returns its rows without their times, sorted."""
-    found = [row for outcome in run(cells(n_seeds), PROTOCOL, n_jobs=jobs, store=store) for row in outcome.rows]
-    return sorted(tuple((name, value) for name, value in row.items() if name not in TIMES) for row in found)
+    rows = [row for outcome in run(cells(n_seeds), PROTOCOL, n_jobs=jobs, store=store) for row in outcome.rows]
+    return sorted(tuple((name, value) for name, value in row.items() if name not in TIMES) for row in rows)
 
 
 def main(

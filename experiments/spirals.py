@@ -28,7 +28,7 @@ from experiments.motions import spirals
 from experiments.published import TABLE_ONE
 from latentds import Demonstration, plotting
 from latentds import report as page
-from latentds.benchmark import COLUMNS, Cell, Outcome, Protocol, run
+from latentds.benchmark import COLUMNS, Cell, Outcome, Paths, RolloutProtocol, run, table
 
 
 def main(
@@ -61,22 +61,20 @@ def main(
     except KeyboardInterrupt:
         console.print(f"Interrupted: {len(done)} of {len(cells)} cells are done; the same command goes on from here.")
     if done:
-        order = {cell.name: i for i, cell in enumerate(cells)}
-        done.sort(key=lambda outcome: order[outcome.method, outcome.demonstration, outcome.seed])
-        every = pd.DataFrame([row for outcome in done for row in outcome.rows])
+        paths: Paths = {}
+        every = table(cells, done, paths)
         rows = every[list(COLUMNS)]
         seconds = time.perf_counter() - began
         settings = {
             "command": {"quick": quick, "jobs": jobs, "seeds": seeds, "seconds": round(seconds, 1)},
-            "protocol": asdict(Protocol()),
+            "protocol": asdict(RolloutProtocol()),
             "methods": {d.name: {m: f(d.dim).settings for m, f in methods(d.name, quick).items()} for d in shown},
         }
         summary = summarize(rows, [d.name for d in shown], list(methods(shown[0].name, quick)))
         report.write(out / "rows.csv", rows.to_csv(index=False))
         report.write(out / "settings.json", settings | {"environment": report.environment()})
         report.write(out / "summary.md", summary)
-        draw(rows, done, shown, out)
-        paths = {(outcome.method, outcome.demonstration, outcome.seed): outcome.paths for outcome in done}
+        draw(rows, paths, shown, out)
         page.write(out / "report.html", every, shown, paths=paths, settings=settings)
         console.print(Markdown(summary))
         console.print(f"{out}: report.html, rows.csv, summary.md, settings.json and pictures, after {seconds:.0f} s")
@@ -103,13 +101,13 @@ def summarize(rows: pd.DataFrame, names: list[str], labels: list[str]) -> str:
     near, demonstrated = rows[rows["start"] > 0], rows[rows["start"] == 0]
     parts = []
     for family in dict.fromkeys(name.split()[0] for name in names):
-        some = [name for name in names if name.startswith(family)]
+        members = [name for name in names if name.startswith(family)]
         title = f"{family.capitalize()} spirals"
-        parts += [f"## {title}: exact DTW over the perturbed starts, mean ± sd", _scores(near, "dtw", some, labels)]
-        parts += [f"## {title}: FastDTW (radius 1), as in the paper", _scores(near, "dtw_fast", some, labels)]
-        parts += [f"## {title}: exact DTW from the demonstrated start", _scores(demonstrated, "dtw", some, labels)]
+        parts += [f"## {title}: exact DTW over the perturbed starts, mean ± sd", _scores(near, "dtw", members, labels)]
+        parts += [f"## {title}: FastDTW (radius 1), as in the paper", _scores(near, "dtw_fast", members, labels)]
+        parts += [f"## {title}: exact DTW from the demonstrated start", _scores(demonstrated, "dtw", members, labels)]
         if demonstrated["seed"].nunique() > 1:
-            parts += [f"## {title}: the same, seed by seed", _by_seed(demonstrated, some)]
+            parts += [f"## {title}: the same, seed by seed", _by_seed(demonstrated, members)]
     parts.append(NOTES)
     if known := [name for name in names if name in TABLE_ONE[RIVALS[0]]]:
         parts += ["## Fit: mean squared error per coordinate beside the paper's Table I", _table_one(rows, known)]
@@ -128,7 +126,7 @@ def _scores(rows: pd.DataFrame, score: str, names: list[str], labels: list[str])
     for name in names:
         # A deterministic method scores the same with every seed: seeds must not count as more starts.
         of = {label: rows[(rows["demonstration"] == name) & (rows["method"] == label)] for label in labels}
-        starts = {label: found.groupby("start")[score].mean() for label, found in of.items()}
+        starts = {label: scored.groupby("start")[score].mean() for label, scored in of.items()}
         means = {label: values.mean(skipna=False) for label, values in starts.items()}
         best = min((mean for mean in means.values() if np.isfinite(mean)), default=np.nan)
         line = [name]
@@ -147,10 +145,10 @@ def _scores(rows: pd.DataFrame, score: str, names: list[str], labels: list[str])
 def _by_seed(rows: pd.DataFrame, names: list[str]) -> str:
     """The methods that a seed changes."""
     rows = rows[rows["demonstration"].isin(names)]
-    found = rows.pivot_table(index=["demonstration", "method"], columns="seed", values="dtw", sort=False)
-    found = found[found.max(axis=1) > found.min(axis=1) * (1 + 1e-9)]
-    lines = [[*key, *("—" if np.isnan(one) else f"{one:.2f}" for one in scores)] for key, *scores in found.itertuples()]
-    return report.table(["spiral", "method", *(f"seed {seed}" for seed in found.columns)], lines)
+    means = rows.pivot_table(index=["demonstration", "method"], columns="seed", values="dtw", sort=False)
+    means = means[means.max(axis=1) > means.min(axis=1) * (1 + 1e-9)]
+    lines = [[*key, *("—" if np.isnan(one) else f"{one:.2f}" for one in scores)] for key, *scores in means.itertuples()]
+    return report.table(["spiral", "method", *(f"seed {seed}" for seed in means.columns)], lines)
 
 
 def _p_values(first: pd.Series, second: pd.Series) -> str:
@@ -175,7 +173,7 @@ def _follows(rows: pd.DataFrame, names: list[str], labels: list[str]) -> str:
     lines = []
     for name in names:
         fits = [rows[(rows["demonstration"] == name) & (rows["method"] == label)] for label in labels]
-        lines.append([name, *(_how_many(found.groupby("seed")["follows"].all().tolist()) for found in fits)])
+        lines.append([name, *(_how_many(fit.groupby("seed")["follows"].all().tolist()) for fit in fits)])
     return report.table(["spiral", *labels], lines)
 
 
@@ -196,10 +194,10 @@ def _failures(rows: pd.DataFrame) -> str:
     )
 
 
-def draw(rows: pd.DataFrame, done: list[Outcome], shown: list[Demonstration], out: Path) -> None:
+def draw(rows: pd.DataFrame, moved: Paths, shown: list[Demonstration], out: Path) -> None:
     order = list(methods(shown[0].name, False))
     for demonstration in shown:
-        first = {o.method: o.paths for o in reversed(done) if o.demonstration == demonstration.name}
+        first = {method: paths for (method, of, _), paths in reversed([*moved.items()]) if of == demonstration.name}
         paths = {label: first[label] for label in order if label in first}
         name = demonstration.name.replace(" ", "_").replace("=", "")
         plotting.replications(demonstration, paths).savefig(out / f"{name}.png")

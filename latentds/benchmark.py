@@ -15,14 +15,17 @@ from numpy.typing import NDArray
 from torch import nn
 
 from .arguments import whole_number
-from .cell import COLUMNS, Cell, Factory, Outcome, Protocol, build, evaluate, isolated_rng, several
+from .cache import CellStore, UnreadableError, fingerprint
+from .cell import COLUMNS, Cell, Factory, Outcome, RolloutProtocol, build, evaluate, reproducible_torch, several
 from .demonstration import Demonstration
-from .store import CellStore, UnreadableError, fingerprint
 
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["COLUMNS", "Cell", "Factory", "Outcome", "Protocol", "compare", "evaluate", "run"]
+Paths = MutableMapping[tuple[str, str, int], NDArray[np.float64]]
+"""{(method, demonstration, seed): rollouts (starts, n_points, n)}."""
+
+__all__ = ["COLUMNS", "Cell", "Factory", "Outcome", "Paths", "RolloutProtocol", "compare", "evaluate", "run", "table"]
 
 
 def compare(
@@ -37,7 +40,8 @@ def compare(
     n_jobs: int | None = None,
     progress: bool = False,
     store: str | os.PathLike[str] | None = None,
-    paths: MutableMapping[tuple[str, str, int], NDArray[np.float64]] | None = None,
+    paths: Paths | None = None,
+    measure: Callable[[Any, Cell], Mapping[str, Any]] | None = None,
 ) -> pd.DataFrame:
     """Fit every method to every demonstration with every seed, roll each out from shared starts, and score it.
 
@@ -58,12 +62,15 @@ def compare(
         n_jobs: processes, as joblib counts them. None: what ``joblib.parallel_config`` says around the call (that is
             how cells go to a Dask or Ray cluster, too), without it all local cores. Rows do not depend on it.
         progress: show a bar with method, demonstration and time left.
-        store: a file that keeps every finished cell (:class:`latentds.store.CellStore`), so that a run that was
+        store: a file that keeps every finished cell (:class:`latentds.cache.CellStore`), so that a run that was
             interrupted goes on where it stopped. A cell is known by its label, the method's settings and code, the
-            demonstrations and judges, the seed and the protocol: if one changes, it is computed anew. Failed cells are
-            not kept, nor are those of a method whose code or settings cannot be read; a warning names it.
+            demonstrations and judges, the seed and the protocol: if one changes, it is computed anew. What of the code
+            is seen, and what not, is said at :func:`latentds.cache.fingerprint`. Failed cells are not kept, nor are
+            those of a method whose code or settings cannot be read; a warning names it.
         paths: a mapping to put the rollouts into, {(method, demonstration, seed): (starts, n_points, n)}, for pictures
             and for :func:`latentds.report.write`.
+        measure: what else the rows hold, in further columns: callable(fitted system, cell) -> mapping from names to
+            numbers or strings; see :class:`Cell`.
 
     Returns:
         One row per method, demonstration, seed and start:
@@ -73,8 +80,8 @@ def compare(
         * ``follows``: whether the fit measured itself and found nothing off (:mod:`latentds.fidelity`); one per cell.
         * ``dtw``, ``dtw_fast``: exact and FastDTW (radius 1) distance to the demonstration, raw sums; ``…_per_point``
           divided by ``n_points``. ``frechet``, ``endpoint_error``, ``path_length_ratio``: see :mod:`latentds.metrics`.
-        * ``converged``: after ``HORIZON`` durations the motion is within ``CONVERGED`` of the demonstration's size from
-          the attractor, and that lies within ``ON_GOAL`` of it from the demonstrated goal.
+        * ``converged``: after 20 durations the motion is no further from the attractor than 1 % of the demonstration's
+          size, and the attractor no further from the demonstrated goal than 1e-6 of it.
         * ``velocity_rmse``, ``velocity_cosine``: the learned field against the demonstrated velocities at the
           demonstrated points, one number per judge.
         * ``mse``: the fit's own. This and all below are one number per cell.
@@ -87,41 +94,52 @@ def compare(
     Warns:
         RuntimeWarning: once, if rows failed.
     """
-    pandas = _studies("pandas")
     motions = _motions(demonstrations, judged_by)
     _check(methods, seeds)
     cells = [
-        Cell(label, factory, shown, seed, judges=judges)
+        Cell(label, factory, shown, seed, judges=judges, measure=measure)
         for shown, judges in motions
         for label, factory in methods.items()
         for seed in seeds
     ]
     _only_once("demonstrations", [cell.demonstration for cell in cells[:: len(methods) * len(seeds)]])
-    outcomes = run(cells, Protocol(n_starts, radius, n_points), n_jobs=n_jobs, progress=progress, store=store)
+    outcomes = run(cells, RolloutProtocol(n_starts, radius, n_points), n_jobs=n_jobs, progress=progress, store=store)
     _try_out(cells)
-    rows: list[dict[str, Any]] = []
-    for outcome in outcomes:
-        rows += outcome.rows
-        if paths is not None:
-            paths[outcome.method, outcome.demonstration, outcome.seed] = outcome.paths
-    place = {key: i for i, key in enumerate(cell.name for cell in cells)}
-    rows.sort(key=lambda row: (place[row["method"], row["demonstration"], row["seed"]], row["start"]))
+    rows = table(cells, outcomes, paths)
     _warn_of_failures(rows)
     plain = all(len(shown) == 1 and judges == shown for shown, judges in motions)
-    columns = COLUMNS if plain else (*COLUMNS[:2], "judge", *COLUMNS[2:])
-    frame: pd.DataFrame = pandas.DataFrame(rows, columns=list(columns))
+    return rows.drop(columns="judge") if plain else rows
+
+
+def table(cells: Sequence[Cell], outcomes: Iterable[Outcome], paths: Paths | None = None) -> pd.DataFrame:
+    """The rows of outcomes as :func:`compare` gives them, in the order of the cells, with the column "judge".
+
+    Args:
+        cells: those that were run.
+        outcomes: of :func:`run` or :func:`latentds.cell.judge`; of some cells only, if a run was interrupted.
+        paths: a mapping to put the rollouts into, as for :func:`compare`.
+    """
+    pandas = _studies("pandas")
+    place = {cell.name: i for i, cell in enumerate(cells)}
+    rows: list[dict[str, Any]] = []
+    for outcome in sorted(outcomes, key=lambda outcome: place[outcome.name]):
+        rows += outcome.rows
+        if paths is not None:
+            paths[outcome.name] = outcome.paths
+    names = dict.fromkeys((*COLUMNS[:2], "judge", *COLUMNS[2:])) | dict.fromkeys(name for row in rows for name in row)
+    frame: pd.DataFrame = pandas.DataFrame(rows, columns=list(names))
     return frame
 
 
 def run(
     cells: Iterable[Cell],
-    protocol: Protocol | None = None,
+    protocol: RolloutProtocol | None = None,
     *,
     n_jobs: int | None = None,
     progress: bool = False,
     store: str | os.PathLike[str] | None = None,
 ) -> Iterator[Outcome]:
-    """Outcomes of the cells, as they end; for studies in which a method's settings change with the demonstration.
+    """Outcomes of the cells, as they end: for studies in which a method's settings change with the demonstration.
 
     Args:
         cells: no two alike in method, demonstration's name and seed.
@@ -132,7 +150,7 @@ def run(
         ValueError: if two cells are alike, before any work.
     """
     cells = list(cells)
-    protocol = Protocol() if protocol is None else protocol
+    protocol = RolloutProtocol() if protocol is None else protocol
     _only_once("cells", [cell.name for cell in cells])
     if n_jobs is not None and (isinstance(n_jobs, bool) or not isinstance(n_jobs, int) or n_jobs == 0):
         raise ValueError(f"n_jobs: expected a whole number other than 0, or None, got {n_jobs!r}")
@@ -140,33 +158,37 @@ def run(
 
 
 def _run(
-    cells: list[Cell], protocol: Protocol, n_jobs: int | None, progress: bool, store: str | os.PathLike[str] | None
+    cells: list[Cell],
+    protocol: RolloutProtocol,
+    n_jobs: int | None,
+    progress: bool,
+    store: str | os.PathLike[str] | None,
 ) -> Iterator[Outcome]:
     with (
         _bar(len(cells)) if progress else nullcontext(lambda outcome: None) as advance,
-        nullcontext() if store is None else CellStore(store) as kept,
+        nullcontext() if store is None else CellStore(store) as finished,
     ):
-        keys = {} if kept is None else _keys(cells, protocol)
+        keys = {} if finished is None else _keys(cells, protocol)
         todo = []
         for cell in cells:
             key = keys.get(cell.name)
-            found = kept.get(key) if kept is not None and key is not None else None
-            if found is None:
+            earlier = finished.get(key) if finished is not None and key is not None else None
+            if earlier is None:
                 todo.append(cell)
             else:
-                outcome = Outcome(*cell.name, *found)
+                outcome = Outcome(*cell.name, *earlier)
                 advance(outcome)
                 yield outcome
         with closing(_spread(todo, protocol, n_jobs)) as outcomes:
             for outcome in outcomes:
-                key = keys.get((outcome.method, outcome.demonstration, outcome.seed))
-                if kept is not None and key is not None and not outcome.rows[0]["error"]:
-                    kept.put(key, outcome.rows, outcome.paths)
+                key = keys.get(outcome.name)
+                if finished is not None and key is not None and not outcome.rows[0]["error"]:
+                    finished.put(key, outcome.rows, outcome.paths)
                 advance(outcome)
                 yield outcome
 
 
-def _spread(cells: list[Cell], protocol: Protocol, n_jobs: int | None) -> Generator[Outcome, None, None]:
+def _spread(cells: list[Cell], protocol: RolloutProtocol, n_jobs: int | None) -> Generator[Outcome, None, None]:
     """The outcomes as they end, from joblib's workers, wherever they are."""
     joblib = _studies("joblib")
     backend, configured = joblib.parallel.get_active_backend()
@@ -180,28 +202,28 @@ def _spread(cells: list[Cell], protocol: Protocol, n_jobs: int | None) -> Genera
         yield from parallel(joblib.delayed(evaluate)(cell, protocol) for cell in cells[first : first + step])
 
 
-def _keys(cells: Sequence[Cell], protocol: Protocol) -> dict[tuple[str, str, int], str | None]:
+def _keys(cells: Sequence[Cell], protocol: RolloutProtocol) -> dict[tuple[str, str, int], str | None]:
     """What finished cells are known by; warns once of each method that no key can stand for."""
-    keys, hidden = {}, {}
+    keys, unreadable = {}, {}
     for cell in cells:
         try:
             keys[cell.name] = _key(cell, protocol)
         except UnreadableError as error:
-            hidden[cell.method] = str(error)
-    for method, reason in hidden.items():
-        told = f"store: {method!r} is not kept but computed by every run: {reason}"
-        warnings.warn(told, RuntimeWarning, stacklevel=2)
+            unreadable[cell.method] = str(error)
+    for method, reason in unreadable.items():
+        message = f"store: {method!r} is not kept but computed by every run: {reason}"
+        warnings.warn(message, RuntimeWarning, stacklevel=2)
     return keys
 
 
-def _key(cell: Cell, protocol: Protocol) -> str | None:
+def _key(cell: Cell, protocol: RolloutProtocol) -> str | None:
     """What a finished cell is known by; None for a method that cannot even be made."""
     try:
-        with isolated_rng(cell.seed):
+        with reproducible_torch(cell.seed):
             ds = build(cell)
     except Exception:
         return None
-    shown, judges = ([(d.positions, d.dt, d.name) for d in some] for some in (cell.shown, cell.judges))
+    shown, judges = ([(d.positions, d.dt, d.name) for d in group] for group in (cell.shown, cell.judges))
     return fingerprint(cell.method, ds, shown, judges, cell.seed, protocol, cell.measure)
 
 
@@ -225,11 +247,11 @@ def _motions(demonstrations: Any, judged_by: Any) -> list[tuple[tuple[Demonstrat
         raise ValueError(f"demonstrations: expected a Demonstration or a non-empty sequence of them, got {items!r}")
     shown = [several(item, "demonstrations") for item in items]
     if judged_by is None:
-        return [(some, some) for some in shown]
+        return [(motion, motion) for motion in shown]
     judges = [judged_by] if alone else judged_by
     if not isinstance(judges, Sequence) or len(judges) != len(shown):
         raise ValueError(f"judged_by: expected one item for each of the {len(shown)} motions, got {judged_by!r}")
-    return [(some, several(item, "judged_by", some[0].dim)) for some, item in zip(shown, judges, strict=True)]
+    return [(motion, several(item, "judged_by", motion[0].dim)) for motion, item in zip(shown, judges, strict=True)]
 
 
 def _check(methods: Any, seeds: Any) -> None:
@@ -252,19 +274,19 @@ def _try_out(cells: Sequence[Cell]) -> None:
     """That every method can be made, once for each dimension: called in vain, it costs no fit."""
     for cell in {(cell.method, cell.shown[0].dim): cell for cell in cells}.values():
         try:
-            with isolated_rng(cell.seed):
+            with reproducible_torch(cell.seed):
                 build(cell)
         except Exception as error:
-            told = f"{type(error).__name__}: {error}"
-            raise ValueError(f"methods: expected {cell.method!r} to make a StableDS, got {told}") from error
+            got = f"{type(error).__name__}: {error}"
+            raise ValueError(f"methods: expected {cell.method!r} to make a StableDS, got {got}") from error
 
 
-def _warn_of_failures(rows: Sequence[Mapping[str, Any]]) -> None:
-    failed = Counter((row["method"], row["error"]) for row in rows if row["error"])
+def _warn_of_failures(rows: pd.DataFrame) -> None:
+    failed = Counter((method, error) for method, error in zip(rows["method"], rows["error"], strict=True) if error)
     if failed:
         reasons = "; ".join(f"{count} of {method!r}, {error}" for (method, error), count in failed.items())
-        told = f"compare: {failed.total()} of {len(rows)} rows failed, their scores are NaN: {reasons}"
-        warnings.warn(told, RuntimeWarning, stacklevel=3)
+        message = f"compare: {failed.total()} of {len(rows)} rows failed, their scores are NaN: {reasons}"
+        warnings.warn(message, RuntimeWarning, stacklevel=3)
 
 
 def _only_once(name: str, items: Sequence[Any]) -> None:

@@ -1,4 +1,4 @@
-"""One cell of a comparison: a method learns a motion, moves from given starts, and is scored by its judges."""
+"""One cell of a comparison: a method learns a motion, then is rolled out and scored."""
 
 from __future__ import annotations
 
@@ -25,11 +25,13 @@ from .demonstration import Demonstration
 from .fidelity import FitWarning
 
 Factory = Callable[[int], StableDS]
+Measure = Callable[[Any, "Cell"], Mapping[str, Any]]
+"""callable(fitted system, cell) -> what else rows hold."""
 
-HORIZON = 20.0
-"""Demonstration durations after which ``converged`` looks where a motion is."""
-CONVERGED = 1e-2
-"""``converged``: largest distance from the attractor by then, as a share of the motion's size."""
+CONVERGED_AFTER = 20.0
+"""``converged``: the motion is looked at after this many durations of the demonstration."""
+CONVERGED_WITHIN = 1e-2
+"""``converged``: largest distance from the attractor then, as a share of the motion's size."""
 ON_GOAL = 1e-6
 """``converged``: largest distance of the attractor from the demonstrated goal, as a share of the motion's size."""
 
@@ -41,7 +43,7 @@ COLUMNS = ("method", "demonstration", "seed", "start", "status", "error", "follo
 
 
 @dataclass(frozen=True)
-class Protocol:
+class RolloutProtocol:
     """From where, how long and how finely a learned system is rolled out.
 
     Args:
@@ -81,7 +83,7 @@ class Protocol:
 
 @dataclass(frozen=True)
 class Cell:
-    """One method, shown one motion, with one seed: one fit, and all its rollouts.
+    """One fit and all its rollouts: a method, a motion that it is shown, and a seed.
 
     Args:
         method: its label.
@@ -92,7 +94,7 @@ class Cell:
             starts where each judge starts and at n_starts points around that, moves for that judge's duration, and is
             compared with that judge. Start 0 is the first judge's own, start 1 + n_starts the second's, and so on:
             with n_starts = 0, start i is judge i's.
-        measure: what else the rows tell: callable(fitted system, cell) -> mapping from names, none of them in
+        measure: what else the rows hold: callable(fitted system, cell) -> mapping from names, none of them in
             ``COLUMNS``, to numbers or strings.
 
     Raises:
@@ -104,7 +106,7 @@ class Cell:
     shown: tuple[Demonstration, ...]
     seed: int
     judges: tuple[Demonstration, ...]
-    measure: Callable[[Any, Cell], Mapping[str, Any]] | None
+    measure: Measure | None
 
     def __init__(
         self,
@@ -114,11 +116,11 @@ class Cell:
         seed: int = 0,
         *,
         judges: Demonstration | Sequence[Demonstration] | None = None,
-        measure: Callable[[Any, Cell], Mapping[str, Any]] | None = None,
+        measure: Measure | None = None,
     ) -> None:
-        some = several(shown, "shown")
-        others = some if judges is None else several(judges, "judges", some[0].dim)
-        vars(self).update(method=method, factory=factory, shown=some, seed=seed, judges=others, measure=measure)
+        fitted = several(shown, "shown")
+        scoring = fitted if judges is None else several(judges, "judges", fitted[0].dim)
+        vars(self).update(method=method, factory=factory, shown=fitted, seed=seed, judges=scoring, measure=measure)
 
     @property
     def demonstration(self) -> str:
@@ -127,7 +129,7 @@ class Cell:
 
     @property
     def name(self) -> tuple[str, str, int]:
-        """Method, demonstration and seed: what tells it from the other cells of a run."""
+        """Method, demonstration and seed, which no other cell of a run shares."""
         return self.method, self.demonstration, self.seed
 
 
@@ -138,7 +140,7 @@ def joint_name(shown: Sequence[Demonstration]) -> str:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a cell.
+    """The result of a cell.
 
     Attributes:
         rows: one mapping per start: from ``COLUMNS``, from "judge" to the judge's name, and what the cell measures.
@@ -151,13 +153,18 @@ class Outcome:
     rows: tuple[dict[str, Any], ...]
     paths: NDArray[np.float64]
 
+    @property
+    def name(self) -> tuple[str, str, int]:
+        """That of its cell."""
+        return self.method, self.demonstration, self.seed
+
 
 @contextmanager
 def interrupts_kept() -> Iterator[None]:
-    """Ctrl-C in this block ends it with KeyboardInterrupt, whatever became of it there.
+    """Ctrl-C in this block always ends it with KeyboardInterrupt.
 
-    What is raised while compiled code calls back into Python is dropped or comes out as another error: an interrupt
-    while numba loads or compiles a kernel as "RuntimeError: no compiled object yet", or not at all.
+    Without this, an exception raised while compiled code calls back into Python is lost or becomes another one: an
+    interrupt while numba compiles a kernel comes out as "RuntimeError: no compiled object yet", or not at all.
     """
     usual = signal.default_int_handler
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) is not usual:
@@ -180,55 +187,90 @@ def interrupts_kept() -> Iterator[None]:
 
 
 @interrupts_kept()
-def evaluate(cell: Cell, protocol: Protocol) -> Outcome:
-    """Fit, roll out and score one cell. Whatever the method raises is told in its rows; Ctrl-C is no failure of it."""
-    shown, judges, share = cell.shown, cell.judges, protocol.n_starts + 1
-    paths = np.full((len(judges), share, protocol.n_points, shown[0].dim), np.nan)
-    converged = np.zeros((len(judges), share), dtype=bool)
-    follows = False
-    facts: dict[str, Any] = dict.fromkeys(SCORES, math.nan)
-    of_judge: list[dict[str, float]] = [{} for _ in judges]
-    error = ""
+def evaluate(cell: Cell, protocol: RolloutProtocol) -> Outcome:
+    """Fit one cell, then :func:`judge` it. Whatever the method raises stands in its rows; Ctrl-C ends the run."""
     try:
-        with isolated_rng(cell.seed):
+        with reproducible_torch(cell.seed):
             ds = build(cell)
             kernels.warmup([ds.dim])  # compiling is nobody's fitting time
             began = time.perf_counter()
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", FitWarning)  # the rows tell it
-                ds.fit(shown[0] if len(shown) == 1 else list(shown))
-            facts["fit_seconds"] = time.perf_counter() - began
-            follows = bool(ds.fit_report and ds.fit_report.fidelity and ds.fit_report.fidelity.follows)
-            of_judge = [_velocity_scores(ds, judge) for judge in judges]
-            more = dict(cell.measure(ds, cell)) if cell.measure else {}
-            if taken := more.keys() & {*COLUMNS, "judge"}:
-                raise ValueError(f"measure: expected names that rows do not have, got {sorted(taken)}")
-            facts |= _facts(ds) | more
-            starts = [protocol.starts(judge) for judge in judges]
-            began = time.perf_counter()
-            with torch.no_grad():
-                moved = [ds.rollout(y0, protocol.times(judge)) for y0, judge in zip(starts, judges, strict=True)]
-                facts["rollout_seconds"] = time.perf_counter() - began
-                converged[:] = [_converged(ds, judge, y0) for y0, judge in zip(starts, judges, strict=True)]
-            for path in moved:
-                if path.shape != paths.shape[1:]:
-                    raise ValueError(f"rollout: expected shape {paths.shape[1:]}, got {tuple(path.shape)}")
-            paths[:] = [path.numpy() for path in moved]
+                warnings.simplefilter("ignore", FitWarning)  # the rows say it
+                ds.fit(cell.shown[0] if len(cell.shown) == 1 else list(cell.shown))
+            seconds = time.perf_counter() - began
     except Exception as raised:
-        error = f"{type(raised).__name__}: {raised}"
+        return _outcome(cell, protocol, error=raised)
+    return judge(ds, cell, protocol, fit_seconds=seconds)
+
+
+@interrupts_kept()
+def judge(ds: StableDS, cell: Cell, protocol: RolloutProtocol, *, fit_seconds: float | None = None) -> Outcome:
+    """Roll out and score a system that is fitted already. Whatever it raises stands in the rows.
+
+    Args:
+        ds: the system.
+        cell: the method's label, what the system was shown, the seed, the judges and what else is measured.
+        protocol: from where, how long and how finely the system is rolled out.
+        fit_seconds: what the rows say of the fit's duration; by default what its report says.
+    """
+    report, judges = ds.fit_report, cell.judges
+    follows = bool(report and report.fidelity and report.fidelity.follows)
+    if fit_seconds is None:
+        fit_seconds = report.seconds if report else math.nan
+    facts: dict[str, Any] = {"fit_seconds": fit_seconds}
+    of_judge: list[dict[str, float]] = []
+    try:
+        with reproducible_torch(cell.seed):
+            of_judge = [_velocity_scores(ds, one) for one in judges]
+            measured = dict(cell.measure(ds, cell)) if cell.measure else {}
+            if taken := measured.keys() & {*COLUMNS, "judge"}:
+                raise ValueError(f"measure: expected names that rows do not have, got {sorted(taken)}")
+            facts |= _facts(ds) | measured
+            starts = [protocol.starts(one) for one in judges]
+            with torch.no_grad():
+                began = time.perf_counter()
+                moved = [ds.rollout(y0, protocol.times(one)) for y0, one in zip(starts, judges, strict=True)]
+                facts["rollout_seconds"] = time.perf_counter() - began
+                converged = np.stack([_converged(ds, one, y0) for y0, one in zip(starts, judges, strict=True)])
+        wanted = protocol.n_starts + 1, protocol.n_points, ds.dim
+        for path in moved:
+            if path.shape != wanted:
+                raise ValueError(f"rollout: expected shape {wanted}, got {tuple(path.shape)}")
+        paths = np.array([path.numpy() for path in moved], dtype=np.float64)
+    except Exception as raised:
+        return _outcome(cell, protocol, facts, of_judge, error=raised)
+    return _outcome(cell, protocol, facts, of_judge, follows, converged, paths)
+
+
+def _outcome(
+    cell: Cell,
+    protocol: RolloutProtocol,
+    facts: Mapping[str, Any] | None = None,
+    of_judge: Sequence[Mapping[str, float]] = (),
+    follows: bool = False,
+    converged: NDArray[np.bool_] | None = None,
+    paths: NDArray[np.float64] | None = None,
+    error: Exception | None = None,
+) -> Outcome:
+    """The rows of a cell; NaN stands for what is missing because of an error."""
+    share = protocol.n_starts + 1
+    if paths is None:
+        paths = np.full((len(cell.judges), share, protocol.n_points, cell.shown[0].dim), np.nan)
+    reason = "" if error is None else f"{type(error).__name__}: {error}"
     rows = [
         {"method": cell.method, "demonstration": cell.demonstration, "seed": cell.seed, "start": share * i + k}
         | {
-            "status": _status(error, path),
-            "error": error,
-            "follows": follows and not error,
-            "converged": bool(converged[i, k]),
+            "status": "failed" if error else "ok" if np.isfinite(path).all() else "diverged",
+            "error": reason,
+            "follows": follows,
+            "converged": converged is not None and bool(converged[i, k]),
         }
         | {"judge": judge.name}
-        | facts
-        | of_judge[i]
+        | dict.fromkeys(SCORES, math.nan)
+        | dict(facts or {})
+        | dict(of_judge[i] if of_judge else {})
         | _scores(path, protocol.reference(judge))
-        for i, judge in enumerate(judges)
+        for i, judge in enumerate(cell.judges)
         for k, path in enumerate(paths[i])
     ]
     return Outcome(*cell.name, tuple(rows), paths.reshape(-1, *paths.shape[2:]))
@@ -276,24 +318,20 @@ def _scores(path: NDArray[np.float64], reference: NDArray[np.float64]) -> dict[s
 
 
 def _converged(ds: StableDS, judge: Demonstration, starts: Tensor) -> NDArray[np.bool_]:
-    later = torch.tensor([0.0, HORIZON * judge.duration], dtype=torch.float64)
+    later = torch.tensor([0.0, CONVERGED_AFTER * judge.duration], dtype=torch.float64)
     left = torch.linalg.vector_norm(ds.rollout(starts, later)[:, -1] - ds.attractor, dim=-1)
     missed = torch.linalg.vector_norm(ds.attractor - judge.goal)
-    arrived = (left <= CONVERGED * judge.size) & (missed <= ON_GOAL * judge.size)
+    arrived = (left <= CONVERGED_WITHIN * judge.size) & (missed <= ON_GOAL * judge.size)
     return np.asarray(arrived.numpy())
 
 
-def _status(error: str, path: NDArray[np.float64]) -> str:
-    return "failed" if error else "ok" if np.isfinite(path).all() else "diverged"
-
-
-_TURN = threading.RLock()
+_RNG_LOCK = threading.RLock()
 
 
 @contextmanager
-def isolated_rng(seed: int) -> Iterator[None]:
-    """Torch's generator seeded and one thread, for this block; both are the process's, so blocks take turns."""
-    with _TURN, torch.random.fork_rng():
+def reproducible_torch(seed: int) -> Iterator[None]:
+    """Torch's generator is seeded and torch uses one thread in this block. Both are global, so blocks take turns."""
+    with _RNG_LOCK, torch.random.fork_rng():
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
         torch.manual_seed(seed)
@@ -304,12 +342,12 @@ def isolated_rng(seed: int) -> Iterator[None]:
 
 
 def several(value: Any, name: str, dim: int | None = None) -> tuple[Demonstration, ...]:
-    """An argument that is one demonstration or more, of one dimension: ``dim`` if given."""
-    found = [value] if isinstance(value, Demonstration) else value
-    if not isinstance(found, Sequence) or not found or not all(isinstance(d, Demonstration) for d in found):
+    """An argument that is one demonstration or a sequence of them, all of one dimension (``dim``, if given)."""
+    items = [value] if isinstance(value, Demonstration) else value
+    if not isinstance(items, Sequence) or not items or not all(isinstance(item, Demonstration) for item in items):
         raise ValueError(f"{name}: expected a Demonstration or a non-empty sequence of them, got {value!r}")
-    wanted = found[0].dim if dim is None else dim
-    for item in found:
+    wanted = items[0].dim if dim is None else dim
+    for item in items:
         if item.dim != wanted:
             raise ValueError(f"{name}: expected demonstrations of {wanted} dimensions, got {item!r}")
-    return tuple(found)
+    return tuple(items)

@@ -14,9 +14,10 @@ from scipy import stats
 
 from baselines import FDM
 from latentds import ChebyshevDS, Demonstration, Learned, StableDS, TubeDS, datasets, metrics
-from latentds.benchmark import COLUMNS, Cell, Protocol, compare, run
+from latentds.benchmark import COLUMNS, Cell, RolloutProtocol, compare, evaluate, run, table
+from latentds.cache import CellStore
+from latentds.cell import judge
 from latentds.fitting.matching import PINS
-from latentds.store import CellStore
 
 SPIRAL = datasets.unstable_spiral(1, 60)
 TIMES = ["fit_seconds", "rollout_seconds"]
@@ -103,7 +104,7 @@ def test_one_row_per_method_demonstration_seed_and_start():
 
 
 def test_scores_are_those_of_the_rollouts():
-    protocol = Protocol(n_starts=2, n_points=50)
+    protocol = RolloutProtocol(n_starts=2, n_points=50)
     (outcome,) = run([Cell("Chebyshev", SMALL["Chebyshev"], SPIRAL)], protocol, n_jobs=1)
     ds = ChebyshevDS(3, n_layers=8).fit(SPIRAL)
     shown = protocol.reference(SPIRAL)
@@ -122,7 +123,7 @@ def test_scores_are_those_of_the_rollouts():
 
 
 def test_starts_are_shared_and_uniform_in_the_ball():
-    protocol = Protocol(n_starts=4000, radius=0.1)
+    protocol = RolloutProtocol(n_starts=4000, radius=0.1)
     starts = protocol.starts(SPIRAL)
     assert (starts[0] == SPIRAL.start).all()
     offsets = (starts[1:] - SPIRAL.start).numpy()
@@ -133,8 +134,8 @@ def test_starts_are_shared_and_uniform_in_the_ball():
     assert directions < 0.05
     other = datasets.stable_spiral(2, 50)
     assert np.allclose(protocol.starts(other) - other.start, starts - SPIRAL.start, atol=1e-15)
-    assert (Protocol(n_starts=20).starts(SPIRAL) == starts[:21]).all()
-    assert (Protocol(n_starts=20, radius=0.0).starts(SPIRAL) == SPIRAL.start).all()
+    assert (RolloutProtocol(n_starts=20).starts(SPIRAL) == starts[:21]).all()
+    assert (RolloutProtocol(n_starts=20, radius=0.0).starts(SPIRAL) == SPIRAL.start).all()
 
 
 def test_a_cell_does_not_depend_on_the_others_nor_on_the_generator():
@@ -194,7 +195,7 @@ def test_a_method_that_cannot_be_made_is_refused_before_any_work(bad, told):
 
 @pytest.mark.parametrize("bad", [refuse, lambda dim: 3])
 def test_a_cell_that_cannot_be_made_tells_it_in_its_rows(bad):
-    (outcome,) = run([Cell("bad", bad, SPIRAL)], Protocol(n_starts=1, n_points=20), n_jobs=1)
+    (outcome,) = run([Cell("bad", bad, SPIRAL)], RolloutProtocol(n_starts=1, n_points=20), n_jobs=1)
     assert [row["status"] for row in outcome.rows] == ["failed"] * 2
 
 
@@ -248,7 +249,9 @@ def test_settings_may_change_with_the_demonstration():
     cells = [
         Cell("FDM", lambda dim, m=m: FDM(dim, n_layers=m), datasets.unstable_spiral(c, 60)) for c, m in ((1, 4), (3, 6))
     ]
-    layers = {o.demonstration: o.rows[0]["n_layers"] for o in run(cells, Protocol(n_starts=0, n_points=20), n_jobs=1)}
+    layers = {
+        o.demonstration: o.rows[0]["n_layers"] for o in run(cells, RolloutProtocol(n_starts=0, n_points=20), n_jobs=1)
+    }
     assert layers == {"unstable c=1": 4 + PINS, "unstable c=3": 6 + PINS}
 
 
@@ -311,17 +314,17 @@ def test_others_may_judge():
     judged = [(m, SPIRAL.name, d.name, i) for m in SMALL for i, d in enumerate(OTHERS)]
     assert list(rows[["method", "demonstration", "judge", "start"]].itertuples(index=False, name=None)) == judged
     ds = ChebyshevDS(3, n_layers=8).fit(SPIRAL)
-    for judge, (_, row) in zip(OTHERS, rows[rows["method"] == "Chebyshev"].iterrows(), strict=True):
-        times = torch.linspace(0, judge.duration, 50, dtype=torch.float64)
+    for one, (_, row) in zip(OTHERS, rows[rows["method"] == "Chebyshev"].iterrows(), strict=True):
+        times = torch.linspace(0, one.duration, 50, dtype=torch.float64)
         with torch.no_grad():
-            path, velocities = ds.rollout(judge.start, times), ds(judge.positions)
-        assert row["dtw"] == pytest.approx(metrics.dtw(path, judge.at(times.numpy())), rel=1e-6)
-        assert row["velocity_rmse"] == pytest.approx(metrics.velocity_rmse(velocities, judge.velocities), rel=1e-6)
+            path, velocities = ds.rollout(one.start, times), ds(one.positions)
+        assert row["dtw"] == pytest.approx(metrics.dtw(path, one.at(times.numpy())), rel=1e-6)
+        assert row["velocity_rmse"] == pytest.approx(metrics.velocity_rmse(velocities, one.velocities), rel=1e-6)
         assert row["mse"] == pytest.approx(ds.fit_report.mse)
 
 
 def test_every_judge_has_its_perturbed_starts():
-    protocol = Protocol(n_starts=2, n_points=20)
+    protocol = RolloutProtocol(n_starts=2, n_points=20)
     (outcome,) = run([Cell("m", Straight, SPIRAL, judges=OTHERS)], protocol, n_jobs=1)
     assert [row["start"] for row in outcome.rows] == list(range(9))
     assert [row["judge"] for row in outcome.rows] == [d.name for d in OTHERS for _ in range(3)]
@@ -338,7 +341,7 @@ def test_several_may_be_shown_as_one_motion():
     ds = tube["TubeDS"](3).fit(OTHERS[:2])
     with torch.no_grad():
         path = ds.rollout(OTHERS[2].start, torch.linspace(0, OTHERS[2].duration, 50, dtype=torch.float64))
-    reference = Protocol(n_points=50).reference(OTHERS[2])
+    reference = RolloutProtocol(n_points=50).reference(OTHERS[2])
     assert rows["dtw"][0] == pytest.approx(metrics.dtw(path, reference), rel=1e-6)
     assert list(compare(tube, [OTHERS[:2]], **QUICK | {"n_starts": 0})["judge"]) == ["low", "high"]
 
@@ -356,7 +359,7 @@ def test_judges_and_what_is_measured_tell_kept_cells_apart(tmp_path):
     def most(ds, cell):
         return {"most": float(ds.rate)}
 
-    protocol, found = Protocol(n_starts=0, n_points=20), []
+    protocol, found = RolloutProtocol(n_starts=0, n_points=20), []
     for settings in ({}, {"judges": OTHERS}, {"judges": OTHERS[:2]}, {"measure": least}, {"measure": most}):
         (outcome,) = run([Cell("m", Straight, SPIRAL, **settings)], protocol, n_jobs=1, store=tmp_path / "cells")
         found.append(outcome)
@@ -369,9 +372,38 @@ def test_judges_and_what_is_measured_tell_kept_cells_apart(tmp_path):
     assert "least" not in found[0].rows[0]
 
 
+def test_a_fitted_system_is_judged_without_another_fit():
+    cell, protocol = Cell("Chebyshev", SMALL["Chebyshev"], SPIRAL, judges=OTHERS), RolloutProtocol(1, 0.1, 20)
+    ds = ChebyshevDS(3, n_layers=8).fit(SPIRAL)
+    ds.fit = lambda *_: pytest.fail("it was fitted again")
+    judged, whole = judge(ds, cell, protocol), evaluate(cell, protocol)
+    frames = [table([cell], [outcome]).drop(columns=TIMES) for outcome in (judged, whole)]
+    assert frames[0].equals(frames[1])
+    assert np.array_equal(judged.paths, whole.paths)
+    assert judged.rows[0]["fit_seconds"] == ds.fit_report.seconds
+    assert judge(ds, cell, protocol, fit_seconds=7.0).rows[0]["fit_seconds"] == 7.0
+
+
+def test_what_is_measured_gets_columns():
+    rows = compare(
+        {"m": Straight}, SPIRAL, measure=lambda ds, cell: {"rate": float(ds.rate), "of": cell.method}, **QUICK
+    )
+    assert tuple(rows.columns) == (*COLUMNS, "rate", "of")
+    assert (rows["rate"] > 1).all()
+    assert (rows["of"] == "m").all()
+
+
+def test_a_table_has_the_order_of_the_cells():
+    cells = [Cell(name, Straight, SPIRAL) for name in "abc"]
+    outcomes, paths = [evaluate(cell, RolloutProtocol(1, 0.1, 20)) for cell in cells], {}
+    rows = table(cells, [outcomes[2], outcomes[0]], paths)
+    assert list(rows["method"]) == ["a", "a", "c", "c"]
+    assert list(paths) == [cells[0].name, cells[2].name]
+
+
 def test_what_is_measured_hides_no_column():
     cell = Cell("m", Straight, SPIRAL, measure=lambda ds, cell: {"mse": 0.0, "more": 1.0})
-    (outcome,) = run([cell], Protocol(n_starts=0, n_points=20), n_jobs=1)
+    (outcome,) = run([cell], RolloutProtocol(n_starts=0, n_points=20), n_jobs=1)
     assert "measure: expected names that rows do not have, got ['mse']" in outcome.rows[0]["error"]
 
 

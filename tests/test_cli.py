@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib.metadata
 import json
 import os
 import re
@@ -19,6 +20,7 @@ from typer.testing import CliRunner
 import latentds
 from latentds import ChebyshevDS, Demonstration, cli, datasets, report
 from latentds.__main__ import main
+from latentds.cli import given
 from latentds.testing import wavy_motion
 
 QUICK = ["--method", "TubeDS,n_layers=20,refined=False"]
@@ -201,7 +203,8 @@ def test_compare_tells_writes_rows_and_a_page(folder):
 
 
 def test_compare_offers_every_method_that_is_installed(folder, monkeypatch):
-    monkeypatch.setattr(cli, "known_methods", lambda: {"TubeDS": latentds.TubeDS, "two": dict})
+    methods = {"TubeDS": latentds.TubeDS, "two": dict}
+    monkeypatch.setattr(given, "known_methods", lambda: methods)
     assert "StableDS, got 'two'" in refused("compare", "mine.csv")  # it was asked for, and is none
     assert "FDM" in run("compare", "--help")[0]
 
@@ -213,7 +216,9 @@ def test_compare_tells_of_a_method_that_fails(folder, monkeypatch):
     monkeypatch.setattr(latentds.TubeDS, "fit", lost)
     methods = "--method", "TubeDS", "--method", "Chebyshev,n_layers=5"
     said, told = run("compare", "mine.csv", *methods, "--starts", 0, "--jobs", 1, "--report", "a.html")
-    assert "note: TubeDS fails on mine: RuntimeError: lost [its] way" in told
+    assert (
+        "note: compare: 1 of 2 rows failed, their scores are NaN: 1 of 'TubeDS', RuntimeError: lost [its] way" in told
+    )
     assert "TubeDS: 1 of 1 motions fail or diverge." in said
     assert "failed" in (folder / "a.html").read_text()
 
@@ -264,8 +269,8 @@ def test_demo_writes_a_recording_that_is_understood(folder):
 def test_a_system_of_a_plugged_in_class_is_loaded(folder, monkeypatch):
     from baselines import FDM
 
-    point = cli.importlib.metadata.EntryPoint("FDM", "baselines:FDM", cli.PLUGINS)
-    monkeypatch.setattr(cli.importlib.metadata, "entry_points", lambda group: {cli.PLUGINS: [point]}[group])
+    point = importlib.metadata.EntryPoint("FDM", "baselines:FDM", given.PLUGINS)
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: {given.PLUGINS: [point]}[group])
     run("fit", "mine.csv", "--method", "FDM,n_layers=10")
     assert isinstance(latentds.load("mine.safetensors", classes=[FDM]), FDM)
     run("rollout", "mine.safetensors")
@@ -319,7 +324,7 @@ def test_an_interrupt_says_so_and_exits_with_130(folder, monkeypatch):
 
 
 def test_a_bug_of_ours_is_no_line(folder, monkeypatch):
-    monkeypatch.setattr(cli, "method_of", lambda text: 1 / 0)
+    monkeypatch.setattr(given, "method_of", lambda text: 1 / 0)
     assert isinstance(CliRunner().invoke(cli.app, ["fit", "mine.csv"]).exception, ZeroDivisionError)
 
 

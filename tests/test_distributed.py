@@ -10,7 +10,7 @@ import pytest
 from baselines import FDM
 from experiments import spirals
 from latentds import ChebyshevDS, compare, datasets
-from latentds.benchmark import COLUMNS, Cell, Protocol, run
+from latentds.benchmark import COLUMNS, Cell, RolloutProtocol, run
 
 distributed = pytest.importorskip("distributed")
 
@@ -47,7 +47,7 @@ SEEDS = range(5)
 def test_rows_equal_the_serial_runs_although_a_worker_was_killed(scheduler):
     import pandas as pd
 
-    protocol = Protocol(n_starts=2, n_points=30)
+    protocol = RolloutProtocol(n_starts=2, n_points=30)
     cells = [Cell(m, f, d, seed) for m, f in METHODS.items() for d in SHOWN for seed in SEEDS]
     serial = [row for outcome in run(cells, protocol, n_jobs=1) for row in outcome.rows]
     found, workers = [], {}

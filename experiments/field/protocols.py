@@ -17,7 +17,7 @@ TRAINING = 4
 
 
 def thinned(shown: Demonstration, stride: int) -> Demonstration:
-    """Every so manyth sample."""
+    """Every ``stride``-th sample."""
     return replace(shown, positions=shown.positions[::stride], dt=shown.dt * stride)
 
 
@@ -26,26 +26,29 @@ def protocol_c(label: str, factory: Factory, shape: Sequence[Demonstration], see
 
     Rows tell, beside the usual, ``train_rmse``, ``train_e``, ``test_rmse`` and ``test_e``: see :func:`velocity_errors`.
     """
-    some = [thinned(shown, 2) for shown in shape]
-    return Cell(label, factory, some[:TRAINING], seed, judges=some[TRAINING:], measure=held_out_velocities)
+    thin = [thinned(shown, 2) for shown in shape]
+    return Cell(label, factory, thin[:TRAINING], seed, judges=thin[TRAINING:], measure=held_out_velocities)
 
 
 def held_out_velocities(ds: StableDS, cell: Cell) -> dict[str, float]:
     """The velocity errors at the samples shown and at the judges'."""
     return {
         f"{part}_{what}": value
-        for part, some in (("train", cell.shown), ("test", cell.judges))
-        for what, value in velocity_errors(ds, some).items()
+        for part, group in (("train", cell.shown), ("test", cell.judges))
+        for what, value in velocity_errors(ds, group).items()
     }
 
 
-def velocity_errors(ds: StableDS, some: Sequence[Demonstration]) -> dict[str, float]:
+def velocity_errors(ds: StableDS, demonstrations: Sequence[Demonstration]) -> dict[str, float]:
     """How far off the velocities are at all samples of some demonstrations together, as ds-opt counts.
 
     ``rmse``: mean over samples of the root of the mean over coordinates of the squared error, units per second; ``e``:
     mean of 1 - cos of the angle, samples at rest left out.
     """
-    positions, shown = torch.cat([d.positions for d in some]), torch.cat([d.velocities for d in some])
+    positions, shown = (
+        torch.cat([d.positions for d in demonstrations]),
+        torch.cat([d.velocities for d in demonstrations]),
+    )
     with torch.no_grad():
         missed = (ds(positions) - shown).numpy()
         cosine = velocity_cosine(ds(positions), shown)

@@ -18,7 +18,7 @@ from experiments.paper.held_out import held_out
 from experiments.paper.plan import Plan
 from experiments.published import TABLE_ONE, TABLE_TWO, Setting
 from latentds import Demonstration
-from latentds.benchmark import Cell, Outcome, Protocol, run
+from latentds.benchmark import Cell, Outcome, RolloutProtocol, run
 from latentds.fitting.tuning import Choice, Tried, choose
 
 SDS_EF = ("SDS-EF", "SDS-EF official")
@@ -56,11 +56,11 @@ class Study:
         """The paper's where it prints one, else its rule's with the least β."""
         return TABLE_ONE[method].get(shown.name) or tuning.setting(self.choice(method, shown).least_beta)
 
-    def protocol(self, *, n_starts: int | None = None, radius: float = 0.1) -> Protocol:
+    def protocol(self, *, n_starts: int | None = None, radius: float = 0.1) -> RolloutProtocol:
         """The plan's; ``n_starts`` of its own if given."""
-        return Protocol(self.plan.n_starts if n_starts is None else n_starts, radius, self.plan.n_points)
+        return RolloutProtocol(self.plan.n_starts if n_starts is None else n_starts, radius, self.plan.n_points)
 
-    def run(self, cells: Iterable[Cell], protocol: Protocol) -> list[Outcome]:
+    def run(self, cells: Iterable[Cell], protocol: RolloutProtocol) -> list[Outcome]:
         return list(run(cells, protocol, n_jobs=self.jobs, progress=True, store=self.store))
 
     @cached_property
@@ -105,5 +105,5 @@ def rows(outcomes: Iterable[Outcome]) -> pd.DataFrame:
 
 def paths(outcomes: Iterable[Outcome], name: str, methods: Iterable[str]) -> dict[str, NDArray[np.float64]]:
     """{method: its rollouts} on the motion of that name."""
-    found = {o.method: o.paths for o in outcomes if o.demonstration == name}
-    return {method: found[method] for method in methods}
+    moved = {o.method: o.paths for o in outcomes if o.demonstration == name}
+    return {method: moved[method] for method in methods}

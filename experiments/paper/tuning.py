@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from experiments.methods import GREEDY
 from experiments.published import Setting
 from latentds import Demonstration
+from latentds.cache import fingerprint
 from latentds.fitting.matching import add_greedy_layers
 from latentds.fitting.tuning import BETAS, DEPTHS, GOOD, MUS, Tried
-from latentds.store import fingerprint
 
 Array = NDArray[np.float64]
 

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .. import plotting
-from ..benchmark import Cell
-from ..certificate import certify
 from ..demonstration import Demonstration
 from ..files import atomic_write
 from .comparison import Comparison
 from .drawn import drawn
+from .measured import findings
 from .verdict import percent, verdict
 
 try:
@@ -44,7 +43,7 @@ def write(
     paths: Mapping[tuple[str, str, int], Any] | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write what :func:`latentds.compare` found as one page of HTML. Atomic.
+    """Write the result of :func:`latentds.compare` as one page of HTML. Atomic.
 
     The page tells which method follows best in a sentence, ranks them in a table that sorts, and shows their motions:
     to turn, to play over time, each method on or off; with distances, speeds, coordinates over time, certificates and
@@ -62,18 +61,18 @@ def write(
     Raises:
         ValueError: if an argument is none of this, or the demonstrations do not fit the rows.
     """
-    found = Comparison(rows, demonstrations)
-    colors = _colors(found.methods)
+    comparison = Comparison(rows, demonstrations)
+    colors = _colors(comparison.methods)
     data = {
-        "labels": found.methods,
+        "labels": comparison.methods,
         "colors": list(colors.values()),
         "shown": plotting.SHOWN,
-        "motions": [drawn(motion, found, paths or {}) for motion in found.motions],
+        "motions": [drawn(motion, comparison, paths or {}) for motion in comparison.motions],
     }
     text = _page(
-        title=found.motions[0].name if len(found.motions) == 1 else f"{len(found.motions)} motions",
-        found=found,
-        verdict=verdict(found),
+        title=comparison.motions[0].name if len(comparison.motions) == 1 else f"{len(comparison.motions)} motions",
+        comparison=comparison,
+        verdict=verdict(comparison),
         settings=_flat({**(settings or {}), **environment()}),
         colors=colors,
         drawn=paths is not None,
@@ -81,12 +80,6 @@ def write(
     )
     with atomic_write(path) as file:
         file.write(text.encode())
-
-
-def findings(ds: Any, cell: Cell) -> dict[str, str]:
-    """For :class:`~latentds.benchmark.Cell`'s ``measure``: the certificate as JSON, and the notes of the fit."""
-    notes = ds.fit_report.notes if ds.fit_report else ()
-    return {"certificate": certify(ds).to_json(), "notes": "; ".join(notes)}
 
 
 def environment() -> dict[str, Any]:
@@ -126,19 +119,19 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> list[tuple[str, str]
         if isinstance(value, Mapping) and any(isinstance(inside, Mapping) for inside in value.values()):
             lines += _flat(value, f"{prefix}{key} · ")
         else:
-            lines.append((f"{prefix}{key}", _told(value)))
+            lines.append((f"{prefix}{key}", _text(value)))
     return lines
 
 
-def _told(value: Any) -> str:
+def _text(value: Any) -> str:
     if isinstance(value, Mapping):
-        return ", ".join(f"{part} {_told(inside)}" for part, inside in value.items())
+        return ", ".join(f"{part} {_text(inside)}" for part, inside in value.items())
     if isinstance(value, (list, tuple)):
-        return ", ".join(map(_told, value))
+        return ", ".join(map(_text, value))
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def _page(**told: Any) -> str:
+def _page(**content: Any) -> str:
     here = Path(__file__).parent
     style, script = ((here / f"page.{kind}").read_text(encoding="utf-8") for kind in ("css", "js"))
     plotly = get_plotlyjs()
@@ -152,5 +145,5 @@ def _page(**told: Any) -> str:
         script=Markup(script),
         plotly=Markup(plotly),
         allowed=" ".join(f"'sha256-{value}'" for value in hashes),
-        **told,
+        **content,
     )

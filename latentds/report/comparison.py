@@ -87,13 +87,15 @@ class Comparison:
         self.rows = rows
         self.methods: list[str] = list(rows["method"].unique())
         items = [demonstrations] if isinstance(demonstrations, Demonstration) else list(demonstrations)
-        found = {joint_name(some): some for some in (several(item, "demonstrations") for item in items)}
-        self.motions = [self._motion(name, found) for name in found if (rows["demonstration"] == name).any()]
-        if absent := set(rows["demonstration"]) - set(found):
+        demonstrated = {joint_name(shown): shown for shown in (several(item, "demonstrations") for item in items)}
+        self.motions = [
+            self._motion(name, demonstrated[name]) for name in demonstrated if (rows["demonstration"] == name).any()
+        ]
+        if absent := set(rows["demonstration"]) - set(demonstrated):
             raise ValueError(f"demonstrations: expected those of the rows, got none named {min(absent)!r}")
 
-    def _motion(self, name: str, found: dict[str, tuple[Demonstration, ...]]) -> Motion:
-        shown, of = found[name], self.rows[self.rows["demonstration"] == name]
+    def _motion(self, name: str, shown: tuple[Demonstration, ...]) -> Motion:
+        of = self.rows[self.rows["demonstration"] == name]
         count = int(of["start"].max()) + 1
         if count % len(shown):
             raise ValueError(f"demonstrations: expected the judges of {name!r}, got {len(shown)} for {count} starts")
@@ -129,15 +131,15 @@ class Comparison:
         lines = []
         for method in self.methods:
             of = self.rows[self.rows["method"] == method]
-            known = [found for motion in self.motions if (found := self.distances(method, motion)) is not None]
+            known = [one for motion in self.motions if (one := self.distances(method, motion)) is not None]
             fits = of.groupby(["demonstration", "seed"], sort=False).first()
             lines.append(
                 {
                     "method": method,
-                    "level": float(np.mean([found.level for found in known])),
-                    "own": float(np.mean([level(found.own) for found in known])),
-                    "spread": float(np.mean([found.spread for found in known])),
-                    "worst": float(np.max([found.judged.max() for found in known])),
+                    "level": float(np.mean([one.level for one in known])),
+                    "own": float(np.mean([level(one.own) for one in known])),
+                    "spread": float(np.mean([one.spread for one in known])),
+                    "worst": float(np.max([one.judged.max() for one in known])),
                     "end": float((of["endpoint_error"] / of["demonstration"].map(sizes)).mean(skipna=False)),
                     "arrives": (int(of["converged"].sum()), len(of)),
                     "follows": (int(fits["follows"].sum()), len(fits)),
@@ -161,12 +163,14 @@ class Comparison:
         """What each fit's certificate says; of several seeds the first one's."""
         if "certificate" not in self.rows:
             return []
-        found = []
+        certificates = []
         for (name, method), of in self.rows.groupby(["demonstration", "method"], sort=False):
             text = of["certificate"].iloc[0]
             if isinstance(text, str):
                 lines: Sequence[dict[str, Any]] = json.loads(text)["lines"]
                 counts = [[line["verdict"] for line in lines].count(kind) for kind in ("proven", "not falsified")]
                 false = [line["claim"] for line in lines if line["verdict"] == "falsified"]
-                found.append({"motion": name, "method": method, "counts": counts, "false": false, "lines": lines})
-        return found
+                certificates.append(
+                    {"motion": name, "method": method, "counts": counts, "false": false, "lines": lines}
+                )
+        return certificates

@@ -24,7 +24,7 @@ GAP = -32768
 """Stands for no number among 16-bit positions."""
 
 
-def drawn(motion: Motion, found: Comparison, paths: Mapping[tuple[str, str, int], Any]) -> dict[str, Any]:
+def drawn(motion: Motion, comparison: Comparison, paths: Mapping[tuple[str, str, int], Any]) -> dict[str, Any]:
     """What ``page.js`` draws of a motion; of several seeds the lowest.
 
     Raises:
@@ -33,17 +33,17 @@ def drawn(motion: Motion, found: Comparison, paths: Mapping[tuple[str, str, int]
     first = motion.shown[0]
     moved: dict[str, Array] = {}
     for label, name, seed in sorted(paths, key=lambda key: key[2]):
-        if name == motion.name and label in found.methods and label not in moved:
+        if name == motion.name and label in comparison.methods and label not in moved:
             array = real_array(paths[label, name, seed], "paths")
             wanted = motion.share * len(motion.shown), first.dim
             if array.ndim != 3 or array.shape[::2] != wanted:
-                told = f"({wanted[0]}, T, {wanted[1]}) for {label!r} and {name!r}"
-                raise ValueError(f"paths: expected {told}, got {array.shape}")
+                expected = f"({wanted[0]}, T, {wanted[1]}) for {label!r} and {name!r}"
+                raise ValueError(f"paths: expected {expected}, got {array.shape}")
             moved[label] = array
-    count, some = _thinned(motion, len(found.motions) * (1 + len(found.methods)))
+    count, others = _thinned(motion, len(comparison.motions) * (1 + len(comparison.methods)))
     n_points = min((len(batch[0]) for batch in moved.values()), default=500)
     grid = _grid(first, min(count, n_points), n_points)
-    chosen = np.unique(np.linspace(1, motion.share - 1, some).round().astype(int)) if some else np.empty(0, int)
+    chosen = np.unique(np.linspace(1, motion.share - 1, others).round().astype(int)) if others else np.empty(0, int)
     starts = np.concatenate([i * motion.share + np.r_[0, chosen] for i in range(len(motion.shown))]).astype(int)
     shown = np.stack([one.at(grid * one.duration) for one in motion.shown])
     middle, half = (shown.min((0, 1)) + shown.max((0, 1))) / 2, motion.size / 2 * WIDER
@@ -63,11 +63,11 @@ def drawn(motion: Motion, found: Comparison, paths: Mapping[tuple[str, str, int]
         "starts": {"drawn": len(starts), "of": motion.share * len(motion.shown)},
         "methods": [
             _rollouts(moved[label], starts, grid, first.duration, low, high) if label in moved else None
-            for label in found.methods
+            for label in comparison.methods
         ],
         "scores": [
             scores and {"own": _finite(scores.own), "others": _finite(scores.others)}
-            for scores in (found.distances(label, motion) for label in found.methods)
+            for scores in (comparison.distances(label, motion) for label in comparison.methods)
         ],
     }
 
@@ -75,10 +75,10 @@ def drawn(motion: Motion, found: Comparison, paths: Mapping[tuple[str, str, int]
 def _thinned(motion: Motion, parts: int) -> tuple[int, int]:
     """Points of each rollout, and rollouts beside each demonstrated start, for which ``parts`` parts of ROOM do."""
     room = ROOM * 3 / 4 / 2 / parts / motion.shown[0].dim / len(motion.shown)
-    some = motion.share - 1
-    if room / (1 + some) < FEWEST:
-        some = max(0, min(some, int(room / FEWEST) - 1))
-    return max(2, int(room / (1 + some))), some
+    others = motion.share - 1
+    if room / (1 + others) < FEWEST:
+        others = max(0, min(others, int(room / FEWEST) - 1))
+    return max(2, int(room / (1 + others))), others
 
 
 def _grid(shown: Demonstration, count: int, n_points: int) -> Array:

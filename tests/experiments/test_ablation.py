@@ -8,7 +8,7 @@ import pytest
 
 from experiments import ablation, floor, goals
 from latentds import ChebyshevDS, Demonstration, TubeDS, datasets
-from latentds.benchmark import Protocol
+from latentds.benchmark import RolloutProtocol
 from latentds.testing import wavy_motion
 
 
@@ -17,25 +17,27 @@ def tube(n_layers):
 
 
 def part(*cells, protocol=None):
-    return ablation.Part("recordings", protocol or Protocol(n_starts=2), list(cells))
+    return ablation.Part("recordings", protocol or RolloutProtocol(n_starts=2), list(cells))
 
 
-def told(some, path):
-    return [ablation.told(some, *pair) for pair in ablation.results(some, 1, path / "cells.sqlite")]
+def rows_of(part, path):
+    """A list for each cell: its rows as mappings."""
+    rows = ablation.results(part, 1, path / "cells.sqlite", {})
+    return [of.to_dict("records") for _, of in rows.groupby(["method", "demonstration"], sort=False)]
 
 
 def test_floor_of_an_even_straight_line():
     """Late by a share f of the step h, a point lies f h from one sample and (1-f) h from another: h/4 on average."""
     way = np.linspace(0, 2, 1000)
     shown = Demonstration(np.stack([way, 0 * way], 1), 0.01)
-    assert floor.sampled(shown, Protocol()) == pytest.approx(2 / 4, rel=0.01)
+    assert floor.sampled(shown, RolloutProtocol()) == pytest.approx(2 / 4, rel=0.01)
 
 
 def test_joining_a_straight_line():
     """Beside its start the offset dies at κ; behind it, m steps h late, m (m+1)/2 h are lost at either end."""
     way = np.linspace(0, 2, 500)
     shown, kappa = Demonstration(np.stack([way, 0 * way], 1), 0.01), 20.0
-    beside, behind = floor.joined(shown, Protocol(), np.array([[0, 0.1], [-5 * way[1], 0]]), kappa)
+    beside, behind = floor.joined(shown, RolloutProtocol(), np.array([[0, 0.1], [-5 * way[1], 0]]), kappa)
     assert beside == pytest.approx(0.1 * np.exp(-kappa * np.linspace(0, 1, 500)).sum(), rel=1e-3)
     assert behind == pytest.approx(5 * 6 * way[1], rel=1e-3)
 
@@ -89,7 +91,7 @@ def test_parts_hold_who_is_shown_and_who_judges():
 
 def test_a_cell_tells_its_scores_and_costs(tmp_path):
     shown = wavy_motion(2)
-    (rows,) = told(part(ablation.cell("TubeDS", tube(20), shown)), tmp_path)
+    (rows,) = rows_of(part(ablation.cell("TubeDS", tube(20), shown)), tmp_path)
     assert [row["start"] for row in rows] == list(range(3))
     assert rows[0]["share"] == pytest.approx(rows[0]["dtw"] / 500 / shown.size)
     assert rows[0]["share"] < 0.01
@@ -101,7 +103,7 @@ def test_a_cell_tells_its_scores_and_costs(tmp_path):
 def test_a_cell_that_fails_says_so(tmp_path):
     loop = np.linspace(0, 2 * np.pi, 100)
     shown = Demonstration(np.stack([np.cos(loop), np.sin(loop)], 1), 0.01, "loop")
-    (rows,) = told(part(ablation.cell("TubeDS", TubeDS, shown, [shown])), tmp_path)
+    (rows,) = rows_of(part(ablation.cell("TubeDS", TubeDS, shown, [shown])), tmp_path)
     assert rows[0]["status"] == "failed"
     assert "does not meet itself" in rows[0]["error"]
     assert np.isnan(rows[0]["share"])
@@ -112,8 +114,8 @@ def test_a_rerun_goes_on_where_it_stopped(tmp_path):
     shown = Demonstration(wavy_motion(2).positions, 0.01, "shown")
     few, more = (ablation.cell(f"TubeDS {n}", tube(n), shown) for n in (10, 20))
     several = ablation.cell("TubeDS", tube(10), [shown, shown], shown)
-    (first,) = told(part(few), tmp_path)
-    again = told(part(more, few, several), tmp_path)
+    (first,) = rows_of(part(few), tmp_path)
+    again = rows_of(part(more, few, several), tmp_path)
     assert again[1] == first  # fit seconds and all
     assert [rows[0]["method"] for rows in again] == ["TubeDS 20", "TubeDS 10", "TubeDS"]
 

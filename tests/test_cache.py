@@ -2,14 +2,12 @@
 
 import functools
 import os
-import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import numba
 import numpy as np
@@ -18,9 +16,9 @@ import torch
 
 from baselines import FDM, SDSEF
 from experiments import kill
-from latentds import ChebyshevDS, Demonstration, datasets, store
-from latentds.benchmark import Cell, Protocol, _key, compare, run
-from latentds.store import CellStore, UnreadableError, fingerprint
+from latentds import ChebyshevDS, Demonstration, TubeDS, cache, datasets, report
+from latentds.benchmark import Cell, RolloutProtocol, _key, compare, run
+from latentds.cache import CellStore, UnreadableError, fingerprint
 
 SPIRAL = datasets.unstable_spiral(1, 60)
 QUICK = {"n_starts": 1, "n_points": 30, "n_jobs": 1}
@@ -68,15 +66,15 @@ def test_a_second_run_computes_nothing_and_gives_the_same_rows(file):
 
 def test_paths_come_back(file):
     cells = [Cell("FDM", lambda dim: FDM(dim, n_layers=5), SPIRAL)]
-    (first,) = run(cells, Protocol(n_starts=1), n_jobs=1, store=file)
-    (again,) = run(cells, Protocol(n_starts=1), n_jobs=1, store=file)
+    (first,) = run(cells, RolloutProtocol(n_starts=1), n_jobs=1, store=file)
+    (again,) = run(cells, RolloutProtocol(n_starts=1), n_jobs=1, store=file)
     assert np.array_equal(first.paths, again.paths)
 
 
 def test_a_run_that_stops_keeps_what_it_has(file):
     methods = {str(i): (lambda dim, i=i: FDM(dim, n_layers=i)) for i in range(1, 7)}
     cells = [Cell(label, factory, SPIRAL) for label, factory in methods.items()]
-    outcomes = run(cells, Protocol(**{k: QUICK[k] for k in ("n_starts", "n_points")}), n_jobs=1, store=file)
+    outcomes = run(cells, RolloutProtocol(**{k: QUICK[k] for k in ("n_starts", "n_points")}), n_jobs=1, store=file)
     seen = {next(outcomes).method, next(outcomes).method}
     outcomes.close()
     with CellStore(file) as store:
@@ -100,7 +98,7 @@ def test_failures_are_tried_again(file):
     cells = [Cell("FDM", factory, SPIRAL), Cell("none", refuse, SPIRAL)]
 
     def status():
-        outcomes = run(cells, Protocol(n_starts=1, n_points=30), n_jobs=1, store=file)
+        outcomes = run(cells, RolloutProtocol(n_starts=1, n_points=30), n_jobs=1, store=file)
         return {outcome.method: [row["status"] for row in outcome.rows] for outcome in outcomes}
 
     assert status() == {"FDM": ["failed"] * 2, "none": ["failed"] * 2}
@@ -114,29 +112,29 @@ def test_everything_that_changes_a_result_changes_its_key():
     keys = [
         _key(cell, protocol)
         for cell, protocol in [
-            (base, Protocol()),
-            (Cell("other", base.factory, demonstration), Protocol()),
-            (Cell("m", lambda dim: SDSEF(dim, n_layers=3, n_features=10), demonstration), Protocol()),
+            (base, RolloutProtocol()),
+            (Cell("other", base.factory, demonstration), RolloutProtocol()),
+            (Cell("m", lambda dim: SDSEF(dim, n_layers=3, n_features=10), demonstration), RolloutProtocol()),
             (
                 Cell("m", lambda dim: SDSEF(dim, n_layers=2, n_features=10, recipe="official"), demonstration),
-                Protocol(),
+                RolloutProtocol(),
             ),
-            (Cell("m", lambda dim: SDSEF(dim, n_layers=2, n_features=10, seed=1), demonstration), Protocol()),
-            (Cell("m", lambda dim: FDM(dim), demonstration), Protocol()),
-            (Cell("m", lambda dim: FDM(dim, beta=0.4), demonstration), Protocol()),
-            (Cell("m", lambda dim: FDM(dim, mu=0.8), demonstration), Protocol()),
-            (Cell("m", base.factory, Demonstration(SPIRAL.positions + 1e-15, SPIRAL.dt, "a")), Protocol()),
-            (Cell("m", base.factory, Demonstration(SPIRAL.positions, 2 * SPIRAL.dt, "a")), Protocol()),
-            (Cell("m", base.factory, Demonstration(SPIRAL.positions, SPIRAL.dt, "b")), Protocol()),
-            (Cell("m", base.factory, demonstration, 1), Protocol()),
-            (base, Protocol(n_starts=19)),
-            (base, Protocol(radius=0.2)),
-            (base, Protocol(n_points=400)),
+            (Cell("m", lambda dim: SDSEF(dim, n_layers=2, n_features=10, seed=1), demonstration), RolloutProtocol()),
+            (Cell("m", lambda dim: FDM(dim), demonstration), RolloutProtocol()),
+            (Cell("m", lambda dim: FDM(dim, beta=0.4), demonstration), RolloutProtocol()),
+            (Cell("m", lambda dim: FDM(dim, mu=0.8), demonstration), RolloutProtocol()),
+            (Cell("m", base.factory, Demonstration(SPIRAL.positions + 1e-15, SPIRAL.dt, "a")), RolloutProtocol()),
+            (Cell("m", base.factory, Demonstration(SPIRAL.positions, 2 * SPIRAL.dt, "a")), RolloutProtocol()),
+            (Cell("m", base.factory, Demonstration(SPIRAL.positions, SPIRAL.dt, "b")), RolloutProtocol()),
+            (Cell("m", base.factory, demonstration, 1), RolloutProtocol()),
+            (base, RolloutProtocol(n_starts=19)),
+            (base, RolloutProtocol(radius=0.2)),
+            (base, RolloutProtocol(n_points=400)),
         ]
     ]
     assert len(set(keys)) == len(keys)
     same = Cell("m", lambda n: SDSEF(n, n_features=10, n_layers=2), Demonstration(SPIRAL.positions, SPIRAL.dt, "a"))
-    assert _key(same, Protocol()) == keys[0]
+    assert _key(same, RolloutProtocol()) == keys[0]
 
 
 class Slots:
@@ -248,72 +246,130 @@ def test_a_changed_class_changes_the_key_of_what_is_made_of_it(monkeypatch, chan
 
 def test_what_torch_does_to_its_own_classes_is_not_the_methods(monkeypatch):
     """As torch.export does once it is used: the cells of a session would be forgotten."""
-    before, made = store.fingerprint(FDM), torch.nn.Module.__init__
+    before, made = fingerprint(FDM), torch.nn.Module.__init__
 
     def patched(self, *args, **kwargs):
         made(self, *args, **kwargs)
 
     monkeypatch.setattr(torch.nn.Module, "__init__", patched)
-    assert store.fingerprint(FDM) == before
+    assert fingerprint(FDM) == before
+
+
+def counted(thing):
+    """The modules whose files are in a thing's key."""
+    pickler = cache._KeyPickler({"latentds.cell"})
+    pickler.dump(thing)
+    return {name for name, _ in cache._sources(pickler.modules)[0]}
+
+
+def test_files_that_a_fit_can_reach_count_and_no_others():
+    common, theirs = counted(1), counted(SDSEF(2))
+    assert {"latentds.cell", "latentds.base", "latentds.metrics", "latentds.kernels.velocity"} < common < theirs
+    assert {"baselines.sdsef", "baselines.couplings"} < theirs
+    assert not theirs & {"baselines.dmp", "baselines.fdm", "baselines"}
+    assert {"latentds.methods.tube", "latentds.fitting.homotopy"} < counted(TubeDS(2))
+    assert "latentds.certificate" in counted(report.findings)
+    assert "latentds.report" not in counted(report.findings)
+    for apart in ("latentds.cli", "latentds.plotting", "latentds.report", "latentds.testing"):
+        assert not [name for name in counted(TubeDS(2)) if name.startswith(apart)]
 
 
 @pytest.fixture
-def forgetful():
-    """What was read of files is read anew."""
-
-    def forget():
-        store._package.cache_clear()
-        store._content.cache_clear()
-
-    yield forget
-    forget()
-
-
-def test_every_file_of_the_library_counts(tmp_path, monkeypatch, forgetful):
-    ours = tmp_path / "latentds"
-    shutil.copytree(Path(store.__file__).parent, ours, ignore=shutil.ignore_patterns("__pycache__"))
-    monkeypatch.setattr(store, "__file__", str(ours / "store.py"))
-    (ours / "deep" / "deeper").mkdir(parents=True)
-    keys = []
-    for name in ("metrics.py", "deep/new.py", "deep/deeper/new.py"):
-        keys.append(fingerprint(1))
-        with (ours / name).open("a") as file:
-            file.write("\n# changed\n")
-        forgetful()
-    keys.append(fingerprint(1))
-    assert len(set(keys)) == 4
-    (ours / "plotting.py").write_text("")  # draws, and changes no number
-    forgetful()
-    assert fingerprint(1) == keys[-1]
-
-
-def test_every_file_of_a_methods_package_counts(tmp_path, monkeypatch, forgetful):
+def their_package(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "theirs" / "inner").mkdir(parents=True)
-    for name in ("__init__.py", "helper.py", "inner/__init__.py"):
-        (tmp_path / "theirs" / name).write_text("")
-    (tmp_path / "theirs" / "method.py").write_text("class Method: pass\n\ndef function(): pass\n")
-    (tmp_path / "alone.py").write_text("def helper(x): return helped * x\nhelped = 1\nclass Alone: pass\n")
-    from alone import Alone, helper
-    from theirs.method import Method, function
+    files = {
+        "theirs/__init__.py": "", "theirs/helper.py": "RATE = 1.0", "theirs/other.py": "", "theirs/lazy.py": "",
+        "theirs/inner/__init__.py": "from . import deep", "theirs/inner/deep.py": "WIDTHS = (1, 2)",
+        "theirs/method.py": "from . import helper\nfrom .inner import deep\nclass Method: pass\n"
+        "def function():\n    from theirs import lazy\n",
+        "alone.py": "def helper(x): return helped * x\nhelped = 1\nclass Alone: pass\n",
+        "calling.py": "from alone import helper\ndef calls(x): return helper(x)\n",
+    }  # fmt: skip
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    yield tmp_path
+    for name in [name for name in sys.modules if name.partition(".")[0] in ("theirs", "alone", "calling")]:
+        del sys.modules[name]
 
-    def calls(x):
-        return helper(x)
+
+def test_files_of_a_methods_package_count_if_the_method_imports_them(their_package, monkeypatch):
+    from alone import Alone
+    from calling import calls
+    from theirs.method import Method, function
 
     things = {"Method": Method(), "function": function, "Alone": Alone(), "calls": calls}
 
-    def changed_by(name):
+    def changed(edit):
         before = {label: fingerprint(thing) for label, thing in things.items()}
-        (tmp_path / name).write_text((tmp_path / name).read_text() + "# changed")
-        forgetful()
+        edit()
         return {label for label, thing in things.items() if fingerprint(thing) != before[label]}
 
-    assert changed_by("theirs/helper.py") == {"Method", "function"}
-    assert changed_by("theirs/inner/__init__.py") == {"Method", "function"}
-    assert changed_by("alone.py") == {"Alone", "calls"}
-    before = fingerprint(calls)
-    monkeypatch.setitem(helper.__globals__, "helped", 2)
-    assert fingerprint(calls) != before
+    def edited(name):
+        with (their_package / name).open("a") as file:
+            return changed(lambda: print("# changed", file=file, flush=True))
+
+    assert edited("theirs/helper.py") == {"Method", "function"}
+    assert edited("theirs/inner/deep.py") == {"Method", "function"}
+    assert edited("theirs/lazy.py") == {"Method", "function"}  # imported in a function, and not yet
+    assert edited("theirs/other.py") == set()
+    assert edited("alone.py") == {"Alone", "calls"}
+    import theirs.helper
+    import theirs.inner.deep
+    import theirs.lazy
+
+    assert changed(lambda: monkeypatch.setattr(theirs.helper, "RATE", 2.0)) == {"Method", "function"}
+    assert changed(lambda: monkeypatch.setattr(theirs.inner.deep, "WIDTHS", [1, 2])) == {"Method", "function"}
+    assert changed(lambda: monkeypatch.setattr("alone.helped", 2)) == {"Alone", "calls"}
+
+
+def test_a_constant_of_this_library_that_was_changed_counts_for_all(monkeypatch):
+    things = (1.5, ChebyshevDS(2, n_layers=2), FDM(2, n_layers=2))
+    before = [fingerprint(thing) for thing in things]
+    monkeypatch.setattr("latentds.cell.CONVERGED_WITHIN", 0.5)
+    assert all(was != fingerprint(thing) for was, thing in zip(before, things, strict=True))
+
+
+def test_running_changes_no_key():
+    """What a run fills and loads on its way, caches and lazy imports, is no part of the settings."""
+
+    def keys():
+        return [fingerprint(TubeDS(3)), fingerprint(SDSEF(3, n_layers=2, n_features=10, seed=1)), fingerprint(FDM(3))]
+
+    before = keys()
+    methods = {"TubeDS": lambda dim: TubeDS(dim, n_layers=10, refined=False), "FDM": lambda dim: FDM(dim, n_layers=5)}
+    compare(methods, SPIRAL, **QUICK)
+    assert keys() == before
+
+
+def test_frozen_and_tied_parameters_count():
+    def layers(change=lambda module: None):
+        torch.manual_seed(0)
+        module = torch.nn.Sequential(torch.nn.Linear(2, 2), torch.nn.Linear(2, 2))
+        module[1].load_state_dict(module[0].state_dict())
+        change(module)
+        return fingerprint(module)
+
+    def tie(module):
+        module[1].weight = module[0].weight
+
+    assert layers() == layers()
+    assert len({layers(), layers(lambda module: module[0].requires_grad_(False)), layers(tie)}) == 3
+
+
+def test_unusual_buffers_and_names_can_be_read():
+    masked = [np.ma.masked_array([1.0, 2.0], mask) for mask in ([True, False], [False, True])]
+    plain = torch.eye(3)
+    things = [
+        plain,
+        plain.to(torch.bfloat16),
+        plain.to_sparse(),
+        plain.clone().requires_grad_(),
+        "\ud800",
+        2**63,
+        *masked,
+    ]
+    assert len({fingerprint(thing) for thing in things}) == len(things)
 
 
 @pytest.mark.parametrize("hidden", [threading.Lock(), (i for i in ()), np.frompyfunc(lambda x: x, 1, 1), sys.stdout])
@@ -325,7 +381,7 @@ def test_what_cannot_be_read_has_no_key(hidden):
 PRINTS = """
 import functools, numba, numpy as np, torch
 from baselines import FDM, SDSEF
-from latentds.store import fingerprint
+from latentds.cache import fingerprint
 
 SCALE = {"b": 2.0, "a": {"x", "y", "z"}}
 
@@ -525,15 +581,6 @@ else: print("ran to its end", flush=True)"""
     assert time.monotonic() - began < 30
     with CellStore(file) as store:
         assert 3 < len(store) < len(kill.cells(60))
-
-
-def test_this_librarys_code_counts_once_and_for_all(monkeypatch):
-    """For what comes from it and for what does not."""
-    things = (1.5, ChebyshevDS(2, n_layers=2), FDM(2, n_layers=2))
-    before = [fingerprint(thing) for thing in things]
-    known, ours = store._package, str(Path(store.__file__).parent)
-    monkeypatch.setattr(store, "_package", lambda folder: b"edited" if folder == ours else known(folder))
-    assert all(was != fingerprint(thing) for was, thing in zip(before, things, strict=True))
 
 
 def test_a_store_takes_no_pickles(file):
