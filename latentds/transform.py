@@ -10,7 +10,7 @@ from torch.distributions import Transform, constraints
 
 from .diffeomorphism import Diffeomorphism
 from .kernels.dispatch import no_active_transforms
-from .memory import Memo, tensors_of
+from .memo import Memo, tensors_of
 
 
 def as_transform(psi: Diffeomorphism, cache_size: int = 0) -> Transform:

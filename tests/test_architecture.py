@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 ROOMS = (
-    "arguments", "memory", "files", "readers", "recordings", "demonstration", "datasets", "time_law", "kernels",
+    "arguments", "memo", "files", "readers", "recordings", "demonstration", "datasets", "time_law", "kernels",
     "diffeomorphism", "transform", "dynamics", "deploy", "integrate", "metrics", "fidelity", "wrappers", "base",
     "fitting", "methods", "storage", "store", "certificate", "testing", "cell", "benchmark", "plotting", "report",
     "cli", "__main__",

@@ -8,7 +8,7 @@ import pickle
 import torch
 from torch import nn
 
-from latentds.memory import Memo, tensors_of
+from latentds.memo import Memo, tensors_of
 
 
 class Counted:
