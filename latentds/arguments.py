@@ -7,7 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
+
+Array = NDArray[np.float64]
+"""Numbers as NumPy holds them here: float64."""
 
 
 def whole_number(value: Any, name: str, *, at_least: int) -> int:

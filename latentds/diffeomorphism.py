@@ -9,15 +9,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar, cast
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch._compile import _disable_dynamo
 from torch.autograd import forward_ad
 
-from .arguments import check_points, check_precision, whole_number
+from .arguments import Array, check_points, check_precision, whole_number
 from .kernels import translations
+from .tabulated import Tabulated
 
 Self = TypeVar("Self", bound="Diffeomorphism")
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -40,7 +39,7 @@ class Invertibility(NamedTuple):
     """(n,) where the map folds space, if the claim is false"""
 
 
-class Diffeomorphism(nn.Module, ABC):
+class Diffeomorphism(Tabulated, nn.Module, ABC):
     """A smooth bijection of R^n with smooth inverse; ``forward`` maps latent -> demonstration.
 
     Subclasses give :meth:`forward`, :meth:`inverse`, :meth:`linearize`, :meth:`jacobian` and
@@ -82,7 +81,7 @@ class Diffeomorphism(nn.Module, ABC):
         moved: Self = super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         return moved
 
-    def layer_table(self) -> NDArray[np.float64] | None:
+    def table(self) -> Array | None:
         """The map as the velocity kernel reads it, a row (c, v, ρ², ρ²‖v‖²) per layer (M, 2n+2); None if it cannot."""
         return None
 
@@ -102,11 +101,11 @@ def strengths_of(directions: Any, widths: Any, mu: float = 1.0) -> Any:
 class Layers(NamedTuple):
     """Locally weighted translations x + exp(-ρ²‖x-c‖²) v, first to last."""
 
-    centers: NDArray[np.float64]
+    centers: Array
     """(m, n)"""
-    directions: NDArray[np.float64]
+    directions: Array
     """(m, n)"""
-    widths: NDArray[np.float64]
+    widths: Array
     """(m,) ρ > 0"""
 
 
@@ -269,9 +268,7 @@ class LocallyWeightedTranslations(Diffeomorphism):
         v = self.directions
         return low - v.clamp(min=0).sum(0), high - v.clamp(max=0).sum(0)
 
-    def layer_table(self) -> NDArray[np.float64] | None:
-        if type(self) is not LocallyWeightedTranslations:
-            return None
+    def table(self) -> Array:
         return translations.layers_of(copy.deepcopy(self).to("cpu", torch.float64))
 
     def _fold(self, index: int) -> tuple[float, ...]:

@@ -6,14 +6,12 @@ import math
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from .arguments import Array
+from .tabulated import LawTable, Tabulated
 from .time_law import TimeLaw
-
-Array = NDArray[np.float64]
 
 
 class Frame(NamedTuple):
@@ -36,7 +34,7 @@ class Frame(NamedTuple):
         return cls(attractor, offset / length, length)
 
 
-class LatentDynamics(nn.Module, ABC):
+class LatentDynamics(Tabulated, nn.Module, ABC):
     """ẋ = g(x), globally asymptotically stable at the frame's attractor; ‖x - x*‖² decreases along every motion."""
 
     @abstractmethod
@@ -58,7 +56,7 @@ class LatentDynamics(nn.Module, ABC):
         """
         return None
 
-    def tables(self, frame: Frame) -> tuple[Array, Array, Array] | None:
+    def table(self, frame: Frame) -> tuple[Array, LawTable, LawTable] | None:
         """(goal, along, across) of :class:`latentds.deploy.tables.FieldTables`; None if it cannot be written so."""
         return None
 
@@ -86,8 +84,8 @@ class RayDynamics(LatentDynamics):
         length = float(frame.length)
         return self.law.convergence_rate_bound(radius / length) if length > 0 else -math.inf
 
-    def tables(self, frame: Frame) -> tuple[Array, Array, Array] | None:
-        law = self.law.table() if type(self) is RayDynamics else None
+    def table(self, frame: Frame) -> tuple[Array, LawTable, LawTable] | None:
+        law = self.law.table()
         return None if law is None else (_goal_table(frame._replace(axis=torch.zeros_like(frame.axis))), law, law)
 
 
@@ -127,11 +125,9 @@ class TubeDynamics(LatentDynamics):
         """s, 1 at the demonstrated start and 0 at x*: (..., n) -> (...)."""
         return _split(x, frame)[0].squeeze(-1)
 
-    def tables(self, frame: Frame) -> tuple[Array, Array, Array] | None:
+    def table(self, frame: Frame) -> tuple[Array, LawTable, LawTable] | None:
         along, across = self.law.table(), self.transverse_law.table()
-        if type(self) is not TubeDynamics or along is None or across is None:
-            return None
-        return _goal_table(frame), along, across
+        return None if along is None or across is None else (_goal_table(frame), along, across)
 
 
 def _split(x: Tensor, frame: Frame) -> tuple[Tensor, Tensor]:

@@ -221,3 +221,13 @@ def test_points_of_another_dimension_are_refused(psi, call, shape, traced):
     points = torch.zeros(shape, dtype=torch.float64, requires_grad=traced)
     with pytest.raises(ValueError, match=r"[xy]: expected shape \(\.\.\., 3\), got "), torch.set_grad_enabled(traced):
         getattr(psi, call)(points)
+
+
+def test_a_table_is_of_the_map_itself_and_of_no_subclass():
+    """One whose layers are made in another way must not be compiled as if they were made in this one."""
+    psi = random_psi(2, 3)
+    assert psi.table().shape == (3, 6)
+    assert AffineCouplings(2, 2, 10).table() is None
+    assert type("Other", (LocallyWeightedTranslations,), {})(2, 3).table() is None
+    torch.nn.utils.parametrize.register_parametrization(psi, "centers", torch.nn.Identity())
+    assert psi.table() is None
