@@ -10,7 +10,8 @@ from torch.distributions import Transform, constraints
 
 from .diffeomorphism import Diffeomorphism
 from .kernels.dispatch import no_active_transforms
-from .memo import Memo, tensors_of
+from .kernels.private import tensors_of
+from .memo import Memo
 
 
 def as_transform(psi: Diffeomorphism, cache_size: int = 0) -> Transform:

@@ -12,8 +12,8 @@ ROOT = Path(__file__).parent.parent
 ROOMS = (
     "arguments", "tabulated", "memo", "files", "readers", "recordings", "demonstration", "datasets", "time_law",
     "kernels", "diffeomorphism", "transform", "dynamics", "deploy", "integrate", "metrics", "fidelity", "wrappers",
-    "base", "fitting", "methods", "storage", "store", "certificate", "testing", "cell", "benchmark", "plotting", "report",
-    "cli", "__main__",
+    "base", "fitting", "methods", "storage", "store", "certificate", "testing", "cell", "benchmark", "plotting",
+    "report", "cli", "__main__",
 )  # fmt: skip
 """Of latentds; each may import itself and those before it."""
 PACKAGES = ("latentds", "baselines", "experiments")

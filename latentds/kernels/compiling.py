@@ -13,6 +13,8 @@ from typing import Any
 
 import numba
 
+from .private import stamp_cache
+
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
 
 
@@ -25,7 +27,7 @@ def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         except RuntimeError:
             return numba.njit(**options)(function)
         # Numba asks only for the age of the file that defines a function; ours inline each other across files.
-        kernel._cache._cache_file._source_stamp = _sources(inspect.getfile(function))
+        stamp_cache(kernel, _sources(inspect.getfile(function)))
         return kernel
 
     return decorate
