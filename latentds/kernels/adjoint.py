@@ -161,12 +161,12 @@ def inverse_adjoint(dim: int) -> Any:
                         continue
                     k = exp(distance * -q)
                     slope = -2.0 * q * k
-                    along, swell = k * 0.0, k * 0.0 + 1.0
+                    along, growth = k * 0.0, k * 0.0 + 1.0
                     for d in range(dim):
                         w = load(held, d * ROWS + u, WIDTH) - layers[j, d]
                         along = along + load(held, at_g + d * ROWS + u, WIDTH) * layers[j, dim + d]
-                        swell = swell + where(k > 0.0, slope * w, k) * layers[j, dim + d]
-                    beta = along / swell
+                        growth = growth + where(k > 0.0, slope * w, k) * layers[j, dim + d]
+                    beta = along / growth
                     for d in range(dim):
                         moved = load(held, d * ROWS + u, WIDTH)
                         change = beta * where(k > 0.0, slope * (moved - layers[j, d]), k)

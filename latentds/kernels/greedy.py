@@ -25,7 +25,9 @@ def greedy_kernel() -> Any:
     inside a bracket, with exact exponentials.
     """
 
-    def greedy(moved: Array, y: Array, beta: float, bound: float, narrowest: float, at: int, layers: Array) -> int:
+    def greedy(
+        moved: Array, y: Array, beta: float, bound: float, largest_rho_squared: float, at: int, layers: Array
+    ) -> int:
         count, dim = moved.shape
         padded = (count + WIDTH - 1) // WIDTH * WIDTH
         x, error = np.zeros(dim * padded), np.zeros(dim * padded)
@@ -65,7 +67,7 @@ def greedy_kernel() -> Any:
             for i in range(count):
                 farthest = max(farthest, d[i])
             # The grid: two chains, q and q√2, doubled until q√2 reaches the bound.
-            limit = min(bound / size, narrowest)
+            limit = min(bound / size, largest_rho_squared)
             doublings = max(0, int(np.ceil(np.log2(max(16.0 * limit * farthest, 1.0)))))
             first = 0.5 * limit * 0.5**doublings
             for i in range(count, padded):
