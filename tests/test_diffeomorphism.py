@@ -63,11 +63,11 @@ def test_forward_and_inverse_match_a_plain_loop(dim, points, strength):
     expected = numpy_forward(psi, points.numpy())
     np.testing.assert_allclose(psi(points), expected, rtol=1e-12, atol=1e-12)
     y = torch.from_numpy(expected)
-    found = psi.inverse(y).numpy()
-    np.testing.assert_allclose(numpy_forward(psi, found), expected, rtol=1e-11, atol=1e-11)
+    x = psi.inverse(y).numpy()
+    np.testing.assert_allclose(numpy_forward(psi, x), expected, rtol=1e-11, atol=1e-11)
     if strength < 10:
-        np.testing.assert_allclose(found, [numpy_inverse(psi, row) for row in expected], rtol=1e-8, atol=1e-8)
-        np.testing.assert_allclose(found, points, rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(x, [numpy_inverse(psi, row) for row in expected], rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(x, points, rtol=1e-8, atol=1e-8)
 
 
 def test_jacobian_determinant_and_tangent_match_autograd(dim, points):

@@ -58,8 +58,8 @@ def test_time_to_go_is_the_integral_of_one_over_speed(law):
             quad(lambda s: 1 / law.speed(torch.tensor([s], dtype=torch.float64)).item(), a, b, epsrel=1e-10)[0]
             for a, b in pairwise(points)
         )
-        found = law.time_to_go(torch.tensor([low, high], dtype=torch.float64)).diff().item()
-        assert found == pytest.approx(seconds, rel=1e-8)
+        taken = law.time_to_go(torch.tensor([low, high], dtype=torch.float64)).diff().item()
+        assert taken == pytest.approx(seconds, rel=1e-8)
 
 
 def test_progress_at_inverts_time_to_go(law):
@@ -75,8 +75,8 @@ def test_flow_agrees_with_solve_ivp(law):
     solved = solve_ivp(
         lambda _, s: -law.speed(torch.from_numpy(s)).numpy(), (0, 2.0), starts, "LSODA", times, rtol=1e-10, atol=1e-13
     )
-    found = law.progress_at(law.time_to_go(torch.from_numpy(starts)).unsqueeze(-1) - torch.from_numpy(times))
-    assert np.abs(found.numpy() - solved.y).max() < 1e-7
+    progress = law.progress_at(law.time_to_go(torch.from_numpy(starts)).unsqueeze(-1) - torch.from_numpy(times))
+    assert np.abs(progress.numpy() - solved.y).max() < 1e-7
 
 
 def test_law_needs_its_duration():
