@@ -132,7 +132,7 @@ class LocallyWeightedTranslations(Diffeomorphism):
     Args:
         dim: n >= 1.
         n_layers: M >= 1.
-        any_number: whether as many as are assigned or loaded replace them.
+        any_number: whether M becomes the number of layers that are assigned or loaded.
 
     Attributes:
         centers: c, (M, n) parameter.
@@ -298,14 +298,15 @@ class LocallyWeightedTranslations(Diffeomorphism):
 
 
 def _layers_of(centers: Tensor, log_widths: Tensor, strengths: Tensor) -> TorchLayers:
+    """As ``LocallyWeightedTranslations._stacked``, of parameters that stand for its own."""
     return centers, directions_of(strengths, log_widths.exp()), torch.exp(2 * log_widths).unsqueeze(-1)
 
 
-def _decoded(layers: TorchLayers, x: Tensor) -> Tensor:
+def _forward(layers: TorchLayers, x: Tensor) -> Tensor:
     return _through(_translate, layers, x)[0]
 
 
-def _encoded(layers: TorchLayers, y: Tensor) -> Tensor:
+def _inverse(layers: TorchLayers, y: Tensor) -> Tensor:
     return _through(_untranslate, layers, y, reverse=True)[0]
 
 
@@ -392,13 +393,13 @@ def _loop_in_graph(
 
 
 ROOT_STEPS = 8
-"""After which every root is found; see :func:`_solve`."""
+"""Steps after which every root is found; see :func:`_solve`."""
 
 
 def _root(w: Tensor, v: Tensor, q: Tensor) -> Tensor:
     """The one s in [0, 1] with s = exp(-q ‖w - s v‖²), over (..., n) -> (..., 1); differentiable twice.
 
-    It is found without a graph; two free Newton steps from it then carry derivatives up to third order.
+    It is computed without a graph; two Newton steps from it, in the graph, carry derivatives up to third order.
     """
     a = q * v.square().sum(-1, keepdim=True)
     b = q * (w * v).sum(-1, keepdim=True)
@@ -446,7 +447,7 @@ def _everywhere(done: Tensor) -> bool:
         return False
 
 
-_FORWARD = Operation(translations.forward, translations.forward_gradients, _decoded, _layers_of)
-_INVERSE = Operation(translations.inverse, translations.inverse_gradients, _encoded, _layers_of)
+_FORWARD = Operation(translations.forward, translations.forward_gradients, _forward, _layers_of)
+_INVERSE = Operation(translations.inverse, translations.inverse_gradients, _inverse, _layers_of)
 _JACOBIAN = Operation(translations.jacobian, translations.jacobian_gradients, _jacobian, _layers_of)
 _PUSH = Operation(translations.push, translations.push_gradients, _pushed, _layers_of)

@@ -1,4 +1,4 @@
-"""What was computed from tensors, kept for as long as their values stay as they were."""
+"""The result of a computation on tensors, kept until one of their values changes."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from .arguments import positive
 from .tabulated import LawKind, LawTable, Tabulated
 
 LINEAR_BELOW = 1e-3
-"""Progress below which laws turn linear, ṡ ∝ -s: one that reaches the goal in finite time is not Lipschitz there."""
+"""Progress below which laws turn linear, ṡ ∝ -s: a law that reaches the goal in finite time is not Lipschitz there."""
 
 
 class TimeLaw(Tabulated, nn.Module, ABC):
@@ -48,7 +48,7 @@ class TimeLaw(Tabulated, nn.Module, ABC):
 class ChebyshevLaw(TimeLaw):
     """h(s) = ω √(s(2-s)), ω = π / (2 duration): the latent motion of the Laplacian eigenmap (paper, Sec. V).
 
-    Below ``LINEAR_BELOW`` linear; above 1, where the eigenmap says nothing, the constant rate ω.
+    It is linear below ``LINEAR_BELOW``, and ω above 1, where the eigenmap says nothing.
 
     Args:
         duration: seconds from s = 1 to s = 0 without the tail, > 0.

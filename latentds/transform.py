@@ -59,7 +59,7 @@ class _AsTransform(Transform):
 
     @property
     def _cached_x_y(self) -> tuple[Any, Any]:
-        """Torch's pair of the last x and y, forgotten when ψ changes: an optimiser would else be told of its past."""
+        """Torch's pair of the last x and y, forgotten when ψ changes; else a training step would see an earlier ψ."""
         x, y = self._pair()
         return x, y
 

@@ -14,8 +14,8 @@ from ..arguments import Array, number_in, positive, real_array
 from ..kernels.velocity import velocity_kernel
 from .tables import VelocityField
 
-NONE: Array = np.empty((1, 0))
-"""Room for no derivatives."""
+NO_SLOPES: Array = np.empty((1, 0))
+"""Where the kernel puts derivatives when none are asked."""
 
 
 class Controller:
@@ -115,7 +115,9 @@ class Controller:
                 out[...] = self._ask(torch.from_numpy(_finite(y))).numpy()
             return out
         rows = y.size // self.dim
-        if not self._kernel(*self._tables, y.reshape(rows, self.dim), out.reshape(rows, self.dim), NONE, self._room()):
+        if not self._kernel(
+            *self._tables, y.reshape(rows, self.dim), out.reshape(rows, self.dim), NO_SLOPES, self._room()
+        ):
             _finite(y)
         return out
 

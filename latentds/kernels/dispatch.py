@@ -17,7 +17,7 @@ from ..arguments import Array
 from . import private
 
 BLOCK = 512
-"""Points that go through the layers together: with what a layer needs of them they fit the L1 cache for n = 3."""
+"""Points that go through the layers together: for n = 3 they and what a layer computes of them fit the L1 cache."""
 
 _local = threading.local()
 
@@ -25,9 +25,9 @@ _local = threading.local()
 def can_use_kernel(names: Sequence[str], module: nn.Module, *tensors: Tensor) -> bool:
     """Whether a kernel may compute ``module``, whose parameters have these names; if not, the torch path does.
 
-    They serve plain CPU tensors in the module's own float32 or float64. Never under torch.func, forward-mode
-    differentiation, tracing, compiling, export or any active torch mode: those see a torch operation only when there is
-    one. For derivatives see :func:`latentds.kernels.functions.evaluate`.
+    Kernels serve plain CPU tensors in the module's own float32 or float64; never under torch.func, forward-mode
+    differentiation, tracing, compiling, export or an active torch mode, which have to see operations of torch. For
+    derivatives see :func:`latentds.kernels.functions.evaluate`.
     """
     if not no_active_transforms():
         return False
@@ -74,7 +74,7 @@ def tensor_of(rows: Array, like: Tensor, shape: Sequence[int]) -> Tensor:
 
 
 PARALLEL_THRESHOLD = 300_000
-"""Point-layers above which more than one core is used; below, a second one costs more than it brings."""
+"""Points times layers above which more than one core is used; below, a second one costs more than it saves."""
 
 _pool: ThreadPoolExecutor | None = None
 _pool_owner = 0

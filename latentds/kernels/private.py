@@ -8,17 +8,18 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from numba.core.typeconv import Conversion
-from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+
+# numba.extending, which is public, gives a type of one's own its layout and its casts, but no operators.
+from numba.core.typeconv import Conversion as Conversion
+from numba.core.typing.templates import AbstractTemplate as AbstractTemplate
+from numba.core.typing.templates import infer_global as infer_global
+from numba.core.typing.templates import signature as signature
 from torch import Tensor, nn
 from torch._compile import _disable_dynamo
 from torch.autograd import forward_ad
 
 disable_dynamo = _disable_dynamo
 """As torch.compiler.disable, which imports all of the compiler, for a second."""
-
-__all__ = ["AbstractTemplate", "Conversion", "infer_global", "signature"]
-# numba.extending gives a type its layout and its casts, but has no operators between two types of one's own.
 
 
 def tracing_active() -> bool:

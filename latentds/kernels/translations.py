@@ -1,8 +1,8 @@
 """Compiled CPU kernels behind locally weighted translations.
 
 A kernel takes points in blocks, held coordinate by coordinate in the L1 cache, sends a block through all layers and
-carries eight points at a time through the arithmetic (:mod:`latentds.kernels.lanes`). Layers that move no point of a
-vector by a rounding error are skipped for it. Everything is computed in float64: a float32 module gets its answer
+carries eight points at a time through the arithmetic (:mod:`latentds.kernels.lanes`). A layer is skipped for eight
+points that it moves by less than a rounding error. Everything is computed in float64: a float32 module gets its answer
 rounded.
 """
 
@@ -34,15 +34,35 @@ can_use_kernel = partial(dispatch.can_use_kernel, PARAMETERS)
 
 
 def forward(layers: Array, x: Tensor) -> Tensor:
-    """ψ; these four take :func:`packed` layers and plain points (..., n)."""
-    return tensor_of(_moved(layers, rows_of(x)), x, x.shape)
+    """ψ(x); this and the three below take layers as :func:`packed` gives them, and plain tensors."""
+    return tensor_of(_swept(layers, rows_of(x), np.empty((1, 0)), 0)[0], x, x.shape)
 
 
-def _moved(layers: Array, points: Array) -> Array:
+def inverse(layers: Array, y: Tensor) -> Tensor:
+    """ψ⁻¹(y)."""
+    points = rows_of(y)
     out = np.empty_like(points)
-    kernel = partial(forward_kernel, points.shape[1], 0)
-    run(kernel, layers, points, np.empty((1, 0)), out, np.empty((len(points), 0)))
-    return out
+    run(partial(inverse_kernel, points.shape[1]), layers, points, out)
+    return tensor_of(out, y, y.shape)
+
+
+def push(layers: Array, x: Tensor, tangent: Tensor) -> Tensor:
+    """J_ψ(x) t."""
+    return tensor_of(_swept(layers, rows_of(x), rows_of(tangent), 1)[1], x, x.shape)
+
+
+def jacobian(layers: Array, x: Tensor) -> Tensor:
+    """J_ψ(x)."""
+    dim = x.shape[-1]
+    return tensor_of(_swept(layers, rows_of(x), np.eye(dim).reshape(1, -1), dim)[1], x, (*x.shape, dim))
+
+
+def _swept(layers: Array, points: Array, tangents: Array, n_tangents: int) -> tuple[Array, Array]:
+    """ψ of points (m, n), and J_ψ of so many tangents at each, (m, n·T) or (1, n·T)."""
+    count, dim = points.shape
+    moved, pushed = np.empty_like(points), np.empty((count, dim * n_tangents))
+    run(partial(forward_kernel, dim, n_tangents), layers, points, tangents, moved, pushed)
+    return moved, pushed
 
 
 def forward_and_adjoint(layers: Array, points: Array) -> tuple[Array, Callable[[Array], Array]]:
@@ -53,29 +73,7 @@ def forward_and_adjoint(layers: Array, points: Array) -> tuple[Array, Callable[[
         kernel = forward_adjoint(points.shape[1], 0)
         return _summed(kernel, layers, points, nothing, of_moved, nothing, np.empty_like(points), nothing)
 
-    return _moved(layers, points), adjoint
-
-
-def inverse(layers: Array, y: Tensor) -> Tensor:
-    points = rows_of(y)
-    out = np.empty_like(points)
-    run(partial(inverse_kernel, points.shape[1]), layers, points, out)
-    return tensor_of(out, y, y.shape)
-
-
-def push(layers: Array, x: Tensor, tangent: Tensor) -> Tensor:
-    """J_ψ(x) of a tangent."""
-    points, tangents = rows_of(x), rows_of(tangent)
-    moved, out = np.empty_like(points), np.empty_like(tangents)
-    run(partial(forward_kernel, points.shape[1], 1), layers, points, tangents, moved, out)
-    return tensor_of(out, x, x.shape)
-
-
-def jacobian(layers: Array, x: Tensor) -> Tensor:
-    points, dim = rows_of(x), x.shape[-1]
-    moved, out = np.empty_like(points), np.empty((len(points), dim * dim))
-    run(partial(forward_kernel, dim, dim), layers, points, np.eye(dim).reshape(1, -1), moved, out)
-    return tensor_of(out, x, (*x.shape, dim))
+    return _swept(layers, points, np.empty((1, 0)), 0)[0], adjoint
 
 
 Gradients = tuple[tuple[Tensor, ...], Array]
@@ -134,7 +132,7 @@ def _summed(kernel: Callable[..., None], layers: Array, points: Array, *by_row: 
             parts.append((points[cut:].ctypes.data, sums.sum(-1)))
 
     run(lambda block: sweep, layers, points, *by_row)
-    # block by block and in the order of the points: to the last bit the same on any number of cores
+    # Block by block in the order of the points, so that the sum is the same to the last bit on any number of cores.
     total = np.zeros(shape[:2])
     for _, part in sorted(parts, key=lambda part: part[0]):
         total += part
@@ -260,7 +258,7 @@ def forward_kernel(dim: int, tangents: int, block: int) -> Any:
                         place = (d + 1) * block + u
                         store(held, place, load(held, place, width) + k * layers[j, dim + d])
             for i in range(count):
-                spoilt = 0.0  # or not a number, as soon as one coordinate is
+                spoilt = 0.0  # NaN if one coordinate is
                 for d in range(dim):
                     spoilt += nan_or_zero(held[(d + 1) * block + i])
                 for d in range(dim):
