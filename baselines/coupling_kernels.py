@@ -42,18 +42,18 @@ class Couplings:
             amplitudes: per layer (2, b, F).
         """
         joined = torch.cat([part.flatten() for part in amplitudes])
-        x, shrink, slope = _Sweep.apply(u, joined, self)  # type: ignore[no-untyped-call]
+        x, inverse_scale, slope = _Sweep.apply(u, joined, self)  # type: ignore[no-untyped-call]
 
         def push(tangent: Tensor) -> Tensor:
             stack = tangent.reshape(-1, *u.shape)
-            pushed: Tensor = _Push.apply(stack, shrink, slope)  # type: ignore[no-untyped-call]
+            pushed: Tensor = _Push.apply(stack, inverse_scale, slope)  # type: ignore[no-untyped-call]
             return pushed.reshape(tangent.shape)
 
         return x, push
 
 
 class _Sweep(torch.autograd.Function):
-    """φ(u), and of every layer's inverse the shrinking (N, L, h) and the slope (N, L, h, h), h = ⌈n/2⌉."""
+    """φ(u), and of every layer's inverse the scale (N, L, h) and the slope (N, L, h, h), h = ⌈n/2⌉."""
 
     @staticmethod
     def forward(ctx: Any, u: Tensor, amplitudes: Tensor, couplings: Couplings) -> tuple[Tensor, Tensor, Tensor]:
@@ -73,10 +73,10 @@ class _Sweep(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
-    def backward(ctx: Any, to_x: Tensor, to_shrink: Tensor, to_slope: Tensor) -> tuple[Tensor, Tensor, None]:
+    def backward(ctx: Any, to_x: Tensor, to_inverse_scale: Tensor, to_slope: Tensor) -> tuple[Tensor, Tensor, None]:
         gradient = to_x.contiguous().clone().numpy()
         to_amplitudes = np.zeros_like(ctx.given[2])
-        others = to_shrink.contiguous().numpy(), to_slope.contiguous().numpy()
+        others = to_inverse_scale.contiguous().numpy(), to_slope.contiguous().numpy()
         _backward(gradient, *others, *ctx.given, *ctx.seen, to_amplitudes)
         return torch.from_numpy(gradient), torch.from_numpy(to_amplitudes), None
 
@@ -85,9 +85,13 @@ class _Push(torch.autograd.Function):
     """Tangents (S, N, n) through the layers' inverses, last layer first."""
 
     @staticmethod
-    def forward(ctx: Any, tangents: Tensor, shrink: Tensor, slope: Tensor) -> Tensor:
+    def forward(ctx: Any, tangents: Tensor, inverse_scale: Tensor, slope: Tensor) -> Tensor:
         count, n_points, dim = tangents.shape
-        ctx.seen = np.empty((count, n_points, shrink.shape[1] + 1, dim), F32), shrink.numpy(), slope.numpy()
+        ctx.seen = (
+            np.empty((count, n_points, inverse_scale.shape[1] + 1, dim), F32),
+            inverse_scale.numpy(),
+            slope.numpy(),
+        )
         ctx.seen[0][:, :, -1] = tangents.numpy()
         _push_forward(*ctx.seen)
         return torch.from_numpy(ctx.seen[0][:, :, 0].copy())
@@ -145,7 +149,7 @@ def _forward(W: Array, b: Array, A: Array, states: Array, grown: Array, affine: 
 @_compiled
 def _backward(
     gradient: Array,
-    to_shrink: Array,
+    to_inverse_scale: Array,
     to_slope: Array,
     W: Array,
     b: Array,
@@ -179,7 +183,7 @@ def _backward(
                     to_slopes[0, i, k] = to_slope[j, layer, i, k] * grown[j, layer, i]
                     to_slopes[1, i, k] = to_slope[j, layer, i, k]
                 growth = math.exp(affine[j, layer, 0, i])
-                to_affine[0, i] = to_grown * grown[j, layer, i] - to_shrink[j, layer, i] / growth
+                to_affine[0, i] = to_grown * grown[j, layer, i] - to_inverse_scale[j, layer, i] / growth
                 to_moved[i] = to_grown * growth
             for h in range(2):
                 _waves(W, b[layer, h], states[j, layer, part::2], w0 + h * read * n_features, cosines, sines)
@@ -200,7 +204,7 @@ def _backward(
 
 
 @_compiled
-def _push_forward(tangents: Array, shrink: Array, slope: Array) -> None:
+def _push_forward(tangents: Array, inverse_scale: Array, slope: Array) -> None:
     """``tangents`` (S, N, L + 1, n) from what entered, at L, to what leaves, at 0."""
     count, n_points, depth, dim = tangents.shape
     for s in range(count):
@@ -215,12 +219,12 @@ def _push_forward(tangents: Array, shrink: Array, slope: Array) -> None:
                     rest = before[2 * i + 1 - part]
                     for k in range(read):
                         rest -= slope[j, layer, i, k] * before[2 * k + part]
-                    after[2 * i + 1 - part] = rest * shrink[j, layer, i]
+                    after[2 * i + 1 - part] = rest * inverse_scale[j, layer, i]
 
 
 @_compiled
 def _push_backward(
-    tangents: Array, shrink: Array, slope: Array, gradient: Array, to_shrink: Array, to_slope: Array
+    tangents: Array, inverse_scale: Array, slope: Array, gradient: Array, to_inverse_scale: Array, to_slope: Array
 ) -> None:
     """``gradient`` enters as the cotangent of what left and leaves as that of what entered."""
     count, n_points, depth, dim = tangents.shape
@@ -233,8 +237,8 @@ def _push_backward(
                 before, after = tangents[s, j, layer + 1], tangents[s, j, layer]
                 for i in range(dim - read):
                     q = 2 * i + 1 - part
-                    to_shrink[j, layer, i] += flow[q] * after[q] / shrink[j, layer, i]
-                    flow[q] *= shrink[j, layer, i]
+                    to_inverse_scale[j, layer, i] += flow[q] * after[q] / inverse_scale[j, layer, i]
+                    flow[q] *= inverse_scale[j, layer, i]
                     for k in range(read):
                         to_slope[j, layer, i, k] -= flow[q] * before[2 * k + part]
                         flow[2 * k + part] -= flow[q] * slope[j, layer, i, k]

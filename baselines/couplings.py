@@ -79,7 +79,7 @@ class AffineCouplings(Diffeomorphism):
         return self._join(parts)
 
     def linearize(self, y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-        """As declared; the map also takes a stack of tangents at once, (..., *y.shape)."""
+        """As in the base class; the map also takes a stack of tangents at once, (..., *y.shape)."""
         u = self.normalize(y)
         parts = [u[..., 0::2], u[..., 1::2]]
         steps = []
@@ -91,9 +91,9 @@ class AffineCouplings(Diffeomorphism):
 
         def push(tangent: Tensor) -> Tensor:
             parts = [tangent[..., 0::2], tangent[..., 1::2]]
-            for source, shrink, slope in reversed(steps):
+            for source, inverse_scale, slope in reversed(steps):
                 sheared = (slope * parts[source].unsqueeze(-2)).sum(-1)
-                parts[1 - source] = (parts[1 - source] - sheared) * shrink
+                parts[1 - source] = (parts[1 - source] - sheared) * inverse_scale
             return self._join(parts) * self.scale
 
         return self._join(parts), push

@@ -29,7 +29,8 @@ from .fidelity import POINTS, ROUNDING, Excerpt, Fidelity, FitWarning, measure, 
 from .files import write_tensors
 from .integrate import integrate
 from .kernels.dispatch import no_active_transforms
-from .memory import Memo, tensors_of
+from .kernels.private import tensors_of
+from .memo import Memo
 from .wrappers import Similarity, check_rotation
 
 FORMAT = 4

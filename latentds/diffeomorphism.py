@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import copy
 import functools
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar, cast
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch._compile import _disable_dynamo
-from torch.autograd import forward_ad
 
-from .arguments import check_points, check_precision, whole_number
-from .kernels import translations
+from .arguments import Array, check_points, check_precision, whole_number
+from .kernels import private, translations
+from .kernels.dispatch import is_plain, no_active_transforms
+from .kernels.functions import Operation, TorchLayers, evaluate
+from .tabulated import Tabulated
 
 Self = TypeVar("Self", bound="Diffeomorphism")
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -40,7 +38,7 @@ class Invertibility(NamedTuple):
     """(n,) where the map folds space, if the claim is false"""
 
 
-class Diffeomorphism(nn.Module, ABC):
+class Diffeomorphism(Tabulated, nn.Module, ABC):
     """A smooth bijection of R^n with smooth inverse; ``forward`` maps latent -> demonstration.
 
     Subclasses give :meth:`forward`, :meth:`inverse`, :meth:`linearize`, :meth:`jacobian` and
@@ -82,7 +80,7 @@ class Diffeomorphism(nn.Module, ABC):
         moved: Self = super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         return moved
 
-    def layer_table(self) -> NDArray[np.float64] | None:
+    def table(self) -> Array | None:
         """The map as the velocity kernel reads it, a row (c, v, ρ², ρ²‖v‖²) per layer (M, 2n+2); None if it cannot."""
         return None
 
@@ -102,23 +100,23 @@ def strengths_of(directions: Any, widths: Any, mu: float = 1.0) -> Any:
 class Layers(NamedTuple):
     """Locally weighted translations x + exp(-ρ²‖x-c‖²) v, first to last."""
 
-    centers: NDArray[np.float64]
+    centers: Array
     """(m, n)"""
-    directions: NDArray[np.float64]
+    directions: Array
     """(m, n)"""
-    widths: NDArray[np.float64]
+    widths: Array
     """(m,) ρ > 0"""
 
 
 def eager_for_derivatives(method: Method) -> Method:
     """Leave the graph of torch.compile for calls whose derivative is asked: a loop there has none, or a wrong one."""
-    eager = _disable_dynamo(method)  # as torch.compiler.disable, without a second of imports
+    eager = private.disable_dynamo(method)
 
     @functools.wraps(method)
     def call(self: nn.Module, *tensors: Tensor) -> Any:
         if torch.compiler.is_compiling() and not torch.compiler.is_exporting():
             asked = torch.is_grad_enabled() and any(t.requires_grad for t in (*tensors, *self.parameters()))
-            if asked or torch._C._are_functorch_transforms_active() or forward_ad._current_level >= 0:
+            if asked or private.function_transforms_active() or private.forward_mode_active():
                 return eager(self, *tensors)  # under fullgraph=True freeze it, or call it within torch.no_grad()
         return method(self, *tensors)
 
@@ -134,7 +132,7 @@ class LocallyWeightedTranslations(Diffeomorphism):
     Args:
         dim: n >= 1.
         n_layers: M >= 1.
-        any_number: whether as many as are assigned or loaded replace them.
+        any_number: whether M becomes the number of layers that are assigned or loaded.
 
     Attributes:
         centers: c, (M, n) parameter.
@@ -167,8 +165,8 @@ class LocallyWeightedTranslations(Diffeomorphism):
     @property
     def directions(self) -> Tensor:
         """v, (M, n), in units of length."""
-        found: Tensor = directions_of(self.strengths, self.widths)
-        return found
+        directions: Tensor = directions_of(self.strengths, self.widths)
+        return directions
 
     @property
     def margins(self) -> Tensor:
@@ -217,42 +215,44 @@ class LocallyWeightedTranslations(Diffeomorphism):
     @eager_for_derivatives
     def forward(self, x: Tensor) -> Tensor:
         check_points(self.dim, x, "x")
-        if translations.can_use_kernel(self, x):
-            return translations.forward(self, x)
-        return self._through(_translate, x)[0]
+        return self._evaluated(_FORWARD, x)
 
     @eager_for_derivatives
     def inverse(self, y: Tensor) -> Tensor:
         check_points(self.dim, y, "y")
-        if translations.can_use_kernel(self, y):
-            return translations.inverse(self, y)
-        return self._through(_untranslate, y, reverse=True)[0]
+        return self._evaluated(_INVERSE, y)
 
     @eager_for_derivatives
     def linearize(self, y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         check_points(self.dim, y, "y")
-        if translations.can_use_kernel(self, y):
-            return translations.linearize(self, y)
-        x = self.inverse(y)
-        return x, functools.partial(self._pushed, x)
+        if not translations.can_use_kernel(self, y):
+            x = self.inverse(y)
+            return x, functools.partial(self._pushed, x)
+        packed, parameters = self._for_kernels()
+        x = evaluate(_INVERSE, packed, parameters, y)
+
+        def push(tangent: Tensor) -> Tensor:
+            if not (no_active_transforms() and is_plain(tangent, x.dtype)):
+                return (self.jacobian(x) @ tangent.unsqueeze(-1)).squeeze(-1)
+            points, tangents = torch.broadcast_tensors(x, tangent)  # type: ignore[no-untyped-call]
+            return evaluate(_PUSH, packed, parameters, points, tangents)
+
+        return x, push
 
     @eager_for_derivatives
     def _pushed(self, x: Tensor, tangent: Tensor) -> Tensor:
         points, tangents = torch.broadcast_tensors(x, tangent)  # type: ignore[no-untyped-call]
-        return self._through(_push, points, tangents.unsqueeze(-2))[1].squeeze(-2)
+        return _through(_push, self._stacked(), points, tangents.unsqueeze(-2))[1].squeeze(-2)
 
     @eager_for_derivatives
     def jacobian(self, x: Tensor) -> Tensor:
         check_points(self.dim, x, "x")
-        if translations.can_use_kernel(self, x):
-            return translations.jacobian(self, x)
-        columns = torch.eye(self.dim, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], self.dim, self.dim)
-        return self._through(_push, x, columns)[1].mT
+        return self._evaluated(_JACOBIAN, x)
 
     @eager_for_derivatives
     def log_abs_det_jacobian(self, x: Tensor) -> Tensor:
         check_points(self.dim, x, "x")
-        return self._through(_swell, x, torch.zeros_like(x[..., 0]))[1]
+        return _through(_step_with_log_det, self._stacked(), x, torch.zeros_like(x[..., 0]))[1]
 
     @torch.no_grad()
     def invertibility(self) -> Invertibility:
@@ -269,35 +269,55 @@ class LocallyWeightedTranslations(Diffeomorphism):
         v = self.directions
         return low - v.clamp(min=0).sum(0), high - v.clamp(max=0).sum(0)
 
-    def layer_table(self) -> NDArray[np.float64] | None:
-        if type(self) is not LocallyWeightedTranslations:
-            return None
-        return translations.layers_of(copy.deepcopy(self).to("cpu", torch.float64))
+    def table(self) -> Array:
+        parameters = self.centers, self.log_widths, self.strengths
+        return translations.packed([parameter.to("cpu", torch.float64) for parameter in parameters])
 
     def _fold(self, index: int) -> tuple[float, ...]:
         """Where a layer that breaks its bound folds space most."""
-        c, v, q = self._layers()[index]
+        layers = list(zip(*self._stacked(), strict=True))[index:]
+        c, v, q = layers[0]
         y = c + v / torch.linalg.vector_norm(v) / (2 * q).sqrt()
-        for c, v, q in self._layers()[index:]:
-            y = y + torch.exp(-q * (y - c).square().sum(-1, keepdim=True)) * v
+        for layer in layers:
+            (y,) = _translate(*layer, y)
         return tuple(y.tolist())
 
-    def _layers(self) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """(c, v, ρ²) of every layer, first to last."""
-        return list(zip(*(part.unbind() for part in self._stacked()), strict=True))
-
-    def _stacked(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(c, v, ρ²) of all layers: (M, n), (M, n), (M, 1)."""
+    def _stacked(self) -> TorchLayers:
+        """(c, v, ρ²) of all layers."""
         return self.centers, self.directions, torch.exp(2 * self.log_widths).unsqueeze(-1)
 
-    def _through(self, step: Step, *state: Tensor, reverse: bool = False) -> tuple[Tensor, ...]:
-        """``state`` after the step of every layer, first to last or the other way round."""
-        if torch.compiler.is_compiling():
-            return _loop_in_graph(step, self._stacked(), state, reverse)
-        layers = self._layers()
-        for layer in reversed(layers) if reverse else layers:
-            state = step(*layer, *state)
-        return state
+    def _for_kernels(self) -> tuple[Array, list[Tensor]]:
+        """The layers as the kernels read them, and the parameters that they are made of."""
+        parameters: Any = private.held_parameters(self, translations.PARAMETERS)
+        return translations.packed(parameters), parameters
+
+    def _evaluated(self, operation: Operation, points: Tensor) -> Tensor:
+        if translations.can_use_kernel(self, points):
+            return evaluate(operation, *self._for_kernels(), points)
+        return operation.by_torch(self._stacked(), points)
+
+
+def _layers_of(centers: Tensor, log_widths: Tensor, strengths: Tensor) -> TorchLayers:
+    """As ``LocallyWeightedTranslations._stacked``, of parameters that stand for its own."""
+    return centers, directions_of(strengths, log_widths.exp()), torch.exp(2 * log_widths).unsqueeze(-1)
+
+
+def _forward(layers: TorchLayers, x: Tensor) -> Tensor:
+    return _through(_translate, layers, x)[0]
+
+
+def _inverse(layers: TorchLayers, y: Tensor) -> Tensor:
+    return _through(_untranslate, layers, y, reverse=True)[0]
+
+
+def _jacobian(layers: TorchLayers, x: Tensor) -> Tensor:
+    dim = x.shape[-1]
+    columns = torch.eye(dim, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], dim, dim)
+    return _through(_push, layers, x, columns)[1].mT
+
+
+def _pushed(layers: TorchLayers, x: Tensor, tangent: Tensor) -> Tensor:
+    return (_jacobian(layers, x) @ tangent.unsqueeze(-1)).squeeze(-1)
 
 
 Step = Callable[..., tuple[Tensor, ...]]
@@ -320,10 +340,20 @@ def _push(c: Tensor, v: Tensor, q: Tensor, x: Tensor, tangents: Tensor) -> tuple
     return x + k * v, tangents + along * v
 
 
-def _swell(c: Tensor, v: Tensor, q: Tensor, x: Tensor, log_volume: Tensor) -> tuple[Tensor, Tensor]:
+def _step_with_log_det(c: Tensor, v: Tensor, q: Tensor, x: Tensor, log_volume: Tensor) -> tuple[Tensor, Tensor]:
     w = x - c
     k = torch.exp(-q * w.square().sum(-1, keepdim=True))
     return x + k * v, log_volume + torch.log1p((-2 * q * k * w * v).sum(-1))  # matrix determinant lemma
+
+
+def _through(step: Step, layers: TorchLayers, *state: Tensor, reverse: bool = False) -> tuple[Tensor, ...]:
+    """``state`` after the step of every layer, first to last or the other way round."""
+    if torch.compiler.is_compiling():
+        return _loop_in_graph(step, layers, state, reverse)
+    each = list(zip(*(part.unbind() for part in layers), strict=True))
+    for layer in reversed(each) if reverse else each:
+        state = step(*layer, *state)
+    return state
 
 
 def _loop_in_graph(
@@ -334,7 +364,7 @@ def _loop_in_graph(
     torch.export records a ``scan``, which is differentiable; torch.compile a ``while_loop``, as its default compiler
     takes a scan under ``fullgraph=True`` alone. On the CPU both compute in float64, as the kernels do.
     """
-    from torch._higher_order_ops import scan, while_loop  # takes a second
+    scan, while_loop = private.graph_loops()
 
     def widened(tensor: Tensor) -> Tensor:
         return (tensor.double() if tensor.is_cpu else tensor).contiguous()
@@ -358,18 +388,18 @@ def _loop_in_graph(
             return index + stride, *step(*layer, *state)
 
         begin = torch.full((1,), first, device=start[0].device)
-        _, *end = while_loop(unfinished, at, (begin, *start))  # type: ignore[no-untyped-call]
+        _, *end = while_loop(unfinished, at, (begin, *start))
     return tuple(new.to(old.dtype) for new, old in zip(end, state, strict=True))
 
 
 ROOT_STEPS = 8
-"""After which every root is found; see :func:`_solve`."""
+"""Steps after which every root is found; see :func:`_solve`."""
 
 
 def _root(w: Tensor, v: Tensor, q: Tensor) -> Tensor:
     """The one s in [0, 1] with s = exp(-q ‖w - s v‖²), over (..., n) -> (..., 1); differentiable twice.
 
-    It is found without a graph; two free Newton steps from it then carry derivatives up to third order.
+    It is computed without a graph; two Newton steps from it, in the graph, carry derivatives up to third order.
     """
     a = q * v.square().sum(-1, keepdim=True)
     b = q * (w * v).sum(-1, keepdim=True)
@@ -409,9 +439,15 @@ def _solve(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
 
 def _everywhere(done: Tensor) -> bool:
     """Whether a loop may end early; never under vmap, export or tracing, where no value can be read or is the last."""
-    if torch.compiler.is_compiling() or torch._C._get_tracing_state() is not None:
+    if torch.compiler.is_compiling() or private.tracing_active():
         return False
     try:
         return bool(done.all())
     except RuntimeError:
         return False
+
+
+_FORWARD = Operation(translations.forward, translations.forward_gradients, _forward, _layers_of)
+_INVERSE = Operation(translations.inverse, translations.inverse_gradients, _inverse, _layers_of)
+_JACOBIAN = Operation(translations.jacobian, translations.jacobian_gradients, _jacobian, _layers_of)
+_PUSH = Operation(translations.push, translations.push_gradients, _pushed, _layers_of)

@@ -6,14 +6,12 @@ import math
 from abc import ABC, abstractmethod
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from .arguments import Array
+from .tabulated import LawTable, Tabulated
 from .time_law import TimeLaw
-
-Array = NDArray[np.float64]
 
 
 class Frame(NamedTuple):
@@ -36,7 +34,7 @@ class Frame(NamedTuple):
         return cls(attractor, offset / length, length)
 
 
-class LatentDynamics(nn.Module, ABC):
+class LatentDynamics(Tabulated, nn.Module, ABC):
     """ẋ = g(x), globally asymptotically stable at the frame's attractor; ‖x - x*‖² decreases along every motion."""
 
     @abstractmethod
@@ -58,13 +56,13 @@ class LatentDynamics(nn.Module, ABC):
         """
         return None
 
-    def tables(self, frame: Frame) -> tuple[Array, Array, Array] | None:
+    def table(self, frame: Frame) -> tuple[Array, LawTable, LawTable] | None:
         """(goal, along, across) of :class:`latentds.deploy.tables.FieldTables`; None if it cannot be written so."""
         return None
 
 
 class RayDynamics(LatentDynamics):
-    """Straight to the goal: the direction of x - x* stays, its length over the frame's follows ``law``.
+    """Straight to the goal: x - x* keeps its direction, and its length in units of the frame's follows ``law``.
 
     The paper's isotropic case.
     """
@@ -75,19 +73,19 @@ class RayDynamics(LatentDynamics):
 
     def forward(self, x: Tensor, y: Tensor, frame: Frame) -> Tensor:
         offset = x - frame.attractor
-        s = _off_zero(offset / frame.length)
+        s = _norm_above_zero(offset / frame.length)
         return -(self.law.speed(s) / s) * offset
 
     def flow(self, x: Tensor, t: Tensor, frame: Frame) -> Tensor:
         offset = (x - frame.attractor).unsqueeze(-2)
-        return frame.attractor + _shrink(self.law, _off_zero(offset / frame.length), t) * offset
+        return frame.attractor + _remaining_share(self.law, _norm_above_zero(offset / frame.length), t) * offset
 
     def convergence_rate_bound(self, radius: float, frame: Frame) -> float:
         length = float(frame.length)
         return self.law.convergence_rate_bound(radius / length) if length > 0 else -math.inf
 
-    def tables(self, frame: Frame) -> tuple[Array, Array, Array] | None:
-        law = self.law.table() if type(self) is RayDynamics else None
+    def table(self, frame: Frame) -> tuple[Array, LawTable, LawTable] | None:
+        law = self.law.table()
         return None if law is None else (_goal_table(frame._replace(axis=torch.zeros_like(frame.axis))), law, law)
 
 
@@ -105,19 +103,20 @@ class TubeDynamics(LatentDynamics):
 
     def forward(self, x: Tensor, y: Tensor, frame: Frame) -> Tensor:
         along, across = _split(x, frame)
-        s, p = _off_zero(along), _off_zero(across)
+        s, p = _norm_above_zero(along), _norm_above_zero(across)
         inward = self.law.speed(s) / s * along * frame.axis + self.transverse_law.speed(p) / p * across
         return -frame.length * inward
 
     def flow(self, x: Tensor, t: Tensor, frame: Frame) -> Tensor:
         along, across = (part.unsqueeze(-2) for part in _split(x, frame))
-        left = _shrink(self.law, _off_zero(along), t) * along * frame.axis
-        return frame.attractor + frame.length * (left + _shrink(self.transverse_law, _off_zero(across), t) * across)
+        ahead = _remaining_share(self.law, _norm_above_zero(along), t) * along * frame.axis
+        aside = _remaining_share(self.transverse_law, _norm_above_zero(across), t) * across
+        return frame.attractor + frame.length * (ahead + aside)
 
     def convergence_rate_bound(self, radius: float, frame: Frame) -> float:
         length, dtype = float(frame.length), frame.axis.dtype
         norm = float(torch.linalg.vector_norm(frame.axis.to(torch.float64)))
-        # by an axis that is longer, what lies along it would also be pushed back
+        # The part across a longer axis would push back along it.
         if not (length > 0 and (norm == 0 or abs(norm - 1) <= 8 * torch.finfo(dtype).eps)):
             return -math.inf
         reach = radius / length
@@ -127,11 +126,9 @@ class TubeDynamics(LatentDynamics):
         """s, 1 at the demonstrated start and 0 at x*: (..., n) -> (...)."""
         return _split(x, frame)[0].squeeze(-1)
 
-    def tables(self, frame: Frame) -> tuple[Array, Array, Array] | None:
+    def table(self, frame: Frame) -> tuple[Array, LawTable, LawTable] | None:
         along, across = self.law.table(), self.transverse_law.table()
-        if type(self) is not TubeDynamics or along is None or across is None:
-            return None
-        return _goal_table(frame), along, across
+        return None if along is None or across is None else (_goal_table(frame), along, across)
 
 
 def _split(x: Tensor, frame: Frame) -> tuple[Tensor, Tensor]:
@@ -146,12 +143,12 @@ def _goal_table(frame: Frame) -> Array:
     return rows.detach().to("cpu", torch.float64, copy=True).numpy()
 
 
-def _shrink(law: TimeLaw, s: Tensor, t: Tensor) -> Tensor:
-    """What is left after ``t`` (T,) of the length s (..., 1, 1): the ratio, (..., T, 1)."""
+def _remaining_share(law: TimeLaw, s: Tensor, t: Tensor) -> Tensor:
+    """The share of the length s (..., 1, 1) that is left after ``t`` (T,) seconds: (..., T, 1)."""
     return law.progress_at(law.time_to_go(s) - t.unsqueeze(-1)) / s
 
 
-def _off_zero(offset: Tensor) -> Tensor:
-    """Length of (..., n) as (..., 1), held off zero far inside the linear tail, where h(s)/s no longer changes."""
+def _norm_above_zero(offset: Tensor) -> Tensor:
+    """(..., n) -> (..., 1), kept above zero by a floor so low that h(s)/s no longer changes there."""
     floor: float = torch.finfo(offset.dtype).tiny ** 0.25
     return (offset.square().sum(-1, keepdim=True) + floor**2).sqrt()

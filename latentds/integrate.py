@@ -24,7 +24,8 @@ from .arguments import refuse_tracing
 
 _STAGES = [*(RK45.A[stage, :stage].tolist() for stage in range(1, 6)), RK45.B.tolist()]  # the last is the step's end
 _ERROR = RK45.E.tolist()
-_BETWEEN = torch.from_numpy(RK45.P.T[::-1].copy())  # the slopes' weights, by falling powers of the share of the step
+_INTERPOLANT = torch.from_numpy(RK45.P.T[::-1].copy())
+"""The slopes' weights, by falling powers of the share of the step."""
 
 
 def integrate(
@@ -35,9 +36,9 @@ def integrate(
     The error of a step, in its worst coordinate, stays below a tolerance: 1e-9 (float32: 1.2e-5, 100 roundings) of the
     distance to the attractor, at the start or now, whichever is larger, plus 16 roundings of the attractor's largest
     coordinate. A row that is nearer to the attractor than ten tolerances has arrived and stays where it is: V does not
-    rise, a long time costs no steps, and a field that keeps its speed up to the attractor is not hopped across for
-    ever. The steps of a row depend neither on the times asked for, which are interpolated, nor on the other rows. No
-    gradient goes through the choice of steps.
+    rise, a long time costs no steps, and a field that keeps its speed up to the attractor does not make it jump to and
+    fro across it. The steps of a row depend neither on the times asked for, which are interpolated, nor on the other
+    rows. No gradient goes through the choice of steps.
 
     Args:
         velocity: (m, n) -> (m, n), row by row, units per second. It is not asked about rows that have arrived.
@@ -128,7 +129,7 @@ def _step(velocity: Callable[[Tensor], Tensor], y: Tensor, slope: Tensor, h: Ten
 def _moved(h: Tensor, share: Tensor, slopes: list[Tensor]) -> Tensor:
     """How far the state has come (m, n) after a share in (0, 1] of a step of h seconds, both (m,)."""
     weights = torch.zeros((), dtype=h.dtype)
-    for coefficients in _BETWEEN.to(h):
+    for coefficients in _INTERPOLANT.to(h):
         weights = (weights + coefficients) * share[:, None]
     return _sum((weights * h[:, None]).to(slopes[0]).T[..., None], slopes)
 

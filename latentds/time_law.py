@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from .arguments import positive
+from .tabulated import LawKind, LawTable, Tabulated
 
-TAIL = 1e-3
-"""Progress below which laws turn linear, ṡ ∝ -s: one that reaches the goal in finite time is not Lipschitz there."""
+LINEAR_BELOW = 1e-3
+"""Progress below which laws turn linear, ṡ ∝ -s: a law that reaches the goal in finite time is not Lipschitz there."""
 
 
-class TimeLaw(nn.Module, ABC):
+class TimeLaw(Tabulated, nn.Module, ABC):
     """ṡ = -h(s) for progress s > 0: 1 at the demonstrated start, 0 at the goal; h(0) = 0, h > 0.
 
     Both maps are elementwise over any shape. :meth:`time_to_go` is strictly increasing, 0 at the edge of the
@@ -40,15 +40,15 @@ class TimeLaw(nn.Module, ABC):
     def convergence_rate_bound(self, reach: float) -> float:
         """The least h(s)/s over 0 < s <= ``reach``, per second; not above 0 if the numbers make no law."""
 
-    def table(self) -> NDArray[np.float64] | None:
-        """The law as compiled code reads it, (2, m): knots and speeds, or the knot -1 and ω; None if it cannot."""
+    def table(self) -> LawTable | None:
+        """The law as numbers, as it is now; None if compiled code cannot compute it."""
         return None
 
 
 class ChebyshevLaw(TimeLaw):
     """h(s) = ω √(s(2-s)), ω = π / (2 duration): the latent motion of the Laplacian eigenmap (paper, Sec. V).
 
-    Below ``TAIL`` linear; above 1, where the eigenmap says nothing, the constant rate ω.
+    It is linear below ``LINEAR_BELOW``, and ω above 1, where the eigenmap says nothing.
 
     Args:
         duration: seconds from s = 1 to s = 0 without the tail, > 0.
@@ -62,24 +62,24 @@ class ChebyshevLaw(TimeLaw):
         self.register_buffer("omega", torch.tensor(omega, dtype=torch.float64))
 
     # s = 1 - cos(angle) = 2 sin²(angle/2) makes the motion uniform in the angle.
-    _edge = 2 * math.asin(math.sqrt(TAIL / 2))
-    _tail_rate = math.sqrt((2 - TAIL) / TAIL)  # in units of ω
+    _edge = 2 * math.asin(math.sqrt(LINEAR_BELOW / 2))
+    _tail_rate = math.sqrt((2 - LINEAR_BELOW) / LINEAR_BELOW)  # in units of ω
 
     def speed(self, s: Tensor) -> Tensor:
-        inside = s.clamp(TAIL, 1.0)
-        return self.omega * torch.where(s < TAIL, self._tail_rate * s, (inside * (2 - inside)).sqrt())
+        inside = s.clamp(LINEAR_BELOW, 1.0)
+        return self.omega * torch.where(s < LINEAR_BELOW, self._tail_rate * s, (inside * (2 - inside)).sqrt())
 
     def time_to_go(self, s: Tensor) -> Tensor:
-        inside = s.clamp(TAIL, 1.0)
+        inside = s.clamp(LINEAR_BELOW, 1.0)
         arc = 2 * torch.asin((inside / 2).sqrt()) - self._edge
-        tail = torch.log(s.clamp(max=TAIL) / TAIL) / self._tail_rate
+        tail = torch.log(s.clamp(max=LINEAR_BELOW) / LINEAR_BELOW) / self._tail_rate
         return (arc + tail + (s - 1).clamp(min=0)) / self.omega
 
     def progress_at(self, time: Tensor) -> Tensor:
         phase = self.omega * time
         top = math.pi / 2 - self._edge
         arc = 2 * torch.sin((phase.clamp(0.0, top) + self._edge) / 2).square()
-        tail = TAIL * torch.exp(self._tail_rate * phase.clamp(max=0.0))
+        tail = LINEAR_BELOW * torch.exp(self._tail_rate * phase.clamp(max=0.0))
         return torch.where(phase < 0, tail, arc + (phase - top).clamp(min=0))
 
     def convergence_rate_bound(self, reach: float) -> float:
@@ -92,8 +92,8 @@ class ChebyshevLaw(TimeLaw):
             return
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
-    def table(self) -> NDArray[np.float64] | None:
-        return np.array([[-1.0], [float(self.omega)]]) if type(self) is ChebyshevLaw else None
+    def table(self) -> LawTable:
+        return LawTable(LawKind.EIGENMAP, np.ones(1), np.array([float(self.omega)]))
 
 
 class PiecewiseLinearLaw(TimeLaw):
@@ -118,7 +118,7 @@ class PiecewiseLinearLaw(TimeLaw):
     def uniform(cls, duration: float = 1.0) -> PiecewiseLinearLaw:
         """Constant rate 1 / duration above the tail: the line that FDM moves on."""
         speed = 1 / positive(duration, "duration")
-        return cls(torch.tensor([TAIL], dtype=torch.float64), torch.tensor([speed], dtype=torch.float64))
+        return cls(torch.tensor([LINEAR_BELOW], dtype=torch.float64), torch.tensor([speed], dtype=torch.float64))
 
     @classmethod
     def from_timing(cls, progress: Tensor, times: Tensor, n_knots: int = 256) -> PiecewiseLinearLaw:
@@ -137,9 +137,9 @@ class PiecewiseLinearLaw(TimeLaw):
         s, t = progress.to(torch.float64).cpu().numpy(), times.to(torch.float64).cpu().numpy()
         clock = (s[0] - s) + s[0] * t / t[-1]
         even = np.interp(np.linspace(0, 2 * s[0], n_knots), clock, s)
-        even = even[even > 2 * TAIL]
+        even = even[even > 2 * LINEAR_BELOW]
         apart = np.concatenate([[True], -np.diff(even) > 1e-6])
-        knots = np.concatenate([even[apart], [TAIL]])[::-1]
+        knots = np.concatenate([even[apart], [LINEAR_BELOW]])[::-1]
         arrivals = np.interp(-knots, -s, t)
         spans = np.maximum(-np.diff(arrivals), 1e-9 * t[-1])
         gaps = np.diff(knots)
@@ -188,10 +188,9 @@ class PiecewiseLinearLaw(TimeLaw):
         ends = torch.cat([self.knots[self.knots < reach], self.knots.new_tensor([reach])])
         return float((self.speed(ends) / ends).min())
 
-    def table(self) -> NDArray[np.float64] | None:
-        if type(self) is not PiecewiseLinearLaw:
-            return None
-        return torch.stack([self.knots, self.speeds]).detach().to("cpu", torch.float64, copy=True).numpy()
+    def table(self) -> LawTable:
+        numbers = torch.stack([self.knots, self.speeds]).detach().to("cpu", torch.float64, copy=True).numpy()
+        return LawTable(LawKind.PIECEWISE_LINEAR, *numbers)
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         """A fit chooses how many knots there are, so a fresh law takes any number."""

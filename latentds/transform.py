@@ -10,7 +10,8 @@ from torch.distributions import Transform, constraints
 
 from .diffeomorphism import Diffeomorphism
 from .kernels.dispatch import no_active_transforms
-from .memory import Memo, tensors_of
+from .kernels.private import tensors_of
+from .memo import Memo
 
 
 def as_transform(psi: Diffeomorphism, cache_size: int = 0) -> Transform:
@@ -58,7 +59,7 @@ class _AsTransform(Transform):
 
     @property
     def _cached_x_y(self) -> tuple[Any, Any]:
-        """Torch's pair of the last x and y, forgotten when ψ changes: an optimiser would else be told of its past."""
+        """Torch's pair of the last x and y, forgotten when ψ changes; else a training step would see an earlier ψ."""
         x, y = self._pair()
         return x, y
 

@@ -72,16 +72,14 @@ class Similarity(nn.Module):
         """Those of the field after, where ``tables`` are those of the field before; in latent space all moves alike."""
         rotation, origin, goal = (part.detach().double().cpu().numpy() for part in (self.rotation, before, after))
         scale, speed, n = float(self.scale), float(self.speed), len(goal)
-        layers, ends, along, across = (part.copy() for part in tables)
+        layers, ends = tables.layers.copy(), tables.goal.copy()
         layers[:, :n] = goal + scale * (layers[:, :n] - origin) @ rotation.T
         layers[:, n : 2 * n] = scale * layers[:, n : 2 * n] @ rotation.T
         layers[:, 2 * n] /= scale**2
         ends[0] = goal + scale * (ends[0] - origin) @ rotation.T
         ends[1] = rotation @ ends[1]
         ends[2] *= scale
-        along[1] *= speed
-        across[1] *= speed
-        return FieldTables(layers, ends, along, across)
+        return FieldTables(layers, ends, tables.along.faster(speed), tables.across.faster(speed))
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         held = {name: state_dict[prefix + name] for name in self._buffers if prefix + name in state_dict}

@@ -63,11 +63,11 @@ def test_forward_and_inverse_match_a_plain_loop(dim, points, strength):
     expected = numpy_forward(psi, points.numpy())
     np.testing.assert_allclose(psi(points), expected, rtol=1e-12, atol=1e-12)
     y = torch.from_numpy(expected)
-    found = psi.inverse(y).numpy()
-    np.testing.assert_allclose(numpy_forward(psi, found), expected, rtol=1e-11, atol=1e-11)
+    x = psi.inverse(y).numpy()
+    np.testing.assert_allclose(numpy_forward(psi, x), expected, rtol=1e-11, atol=1e-11)
     if strength < 10:
-        np.testing.assert_allclose(found, [numpy_inverse(psi, row) for row in expected], rtol=1e-8, atol=1e-8)
-        np.testing.assert_allclose(found, points, rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(x, [numpy_inverse(psi, row) for row in expected], rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(x, points, rtol=1e-8, atol=1e-8)
 
 
 def test_jacobian_determinant_and_tangent_match_autograd(dim, points):
@@ -221,3 +221,13 @@ def test_points_of_another_dimension_are_refused(psi, call, shape, traced):
     points = torch.zeros(shape, dtype=torch.float64, requires_grad=traced)
     with pytest.raises(ValueError, match=r"[xy]: expected shape \(\.\.\., 3\), got "), torch.set_grad_enabled(traced):
         getattr(psi, call)(points)
+
+
+def test_a_table_is_of_the_map_itself_and_of_no_subclass():
+    """One whose layers are made in another way must not be compiled as if they were made in this one."""
+    psi = random_psi(2, 3)
+    assert psi.table().shape == (3, 6)
+    assert AffineCouplings(2, 2, 10).table() is None
+    assert type("Other", (LocallyWeightedTranslations,), {})(2, 3).table() is None
+    torch.nn.utils.parametrize.register_parametrization(psi, "centers", torch.nn.Identity())
+    assert psi.table() is None

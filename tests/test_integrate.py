@@ -189,10 +189,10 @@ def test_gradients_are_those_of_finite_differences(starts):
 def test_gradients_are_those_of_the_flow(starts):
     times = TIMES[:11:2]
     flow = torch.linalg.matrix_exp(times[:, None, None] * TURNING)
-    found = torch.func.jacrev(lambda y: integrate(turning, y, times, ORIGIN))(starts[0])
-    assert (found - flow).abs().max() < 1e-8
-    _, found = torch.func.jvp(lambda y: integrate(turning, y, times, ORIGIN), (starts,), (starts,))
-    assert (found - torch.einsum("tij,bj->bti", flow, starts)).abs().max() < 1e-8
+    jacobian = torch.func.jacrev(lambda y: integrate(turning, y, times, ORIGIN))(starts[0])
+    assert (jacobian - flow).abs().max() < 1e-8
+    _, pushed = torch.func.jvp(lambda y: integrate(turning, y, times, ORIGIN), (starts,), (starts,))
+    assert (pushed - torch.einsum("tij,bj->bti", flow, starts)).abs().max() < 1e-8
 
 
 @pytest.mark.slow

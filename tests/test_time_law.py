@@ -10,12 +10,12 @@ import torch
 from scipy.integrate import quad, solve_ivp
 
 from latentds.dynamics import Frame, RayDynamics
-from latentds.time_law import TAIL, ChebyshevLaw, PiecewiseLinearLaw
+from latentds.time_law import LINEAR_BELOW, ChebyshevLaw, PiecewiseLinearLaw
 
 
 def random_law(seed, n_knots):
     draw = np.random.default_rng(seed)
-    knots = np.sort(draw.uniform(TAIL, 1.5, n_knots))
+    knots = np.sort(draw.uniform(LINEAR_BELOW, 1.5, n_knots))
     return PiecewiseLinearLaw(torch.from_numpy(knots), torch.from_numpy(np.exp(draw.uniform(-3, 2, n_knots))))
 
 
@@ -50,16 +50,16 @@ def test_speed_is_continuous(law):
 
 
 def test_time_to_go_is_the_integral_of_one_over_speed(law):
-    edges = sorted({TAIL, 1.0, *getattr(law, "knots", torch.zeros(0)).tolist()})
-    for low, high in [(2e-4, 8e-4), (TAIL, 0.01), (0.05, 0.9), (0.5, 2.5)]:
+    edges = sorted({LINEAR_BELOW, 1.0, *getattr(law, "knots", torch.zeros(0)).tolist()})
+    for low, high in [(2e-4, 8e-4), (LINEAR_BELOW, 0.01), (0.05, 0.9), (0.5, 2.5)]:
         inner = [edge for edge in edges if low < edge < high]
         points = [low, *inner, high]
         seconds = sum(
             quad(lambda s: 1 / law.speed(torch.tensor([s], dtype=torch.float64)).item(), a, b, epsrel=1e-10)[0]
             for a, b in pairwise(points)
         )
-        found = law.time_to_go(torch.tensor([low, high], dtype=torch.float64)).diff().item()
-        assert found == pytest.approx(seconds, rel=1e-8)
+        taken = law.time_to_go(torch.tensor([low, high], dtype=torch.float64)).diff().item()
+        assert taken == pytest.approx(seconds, rel=1e-8)
 
 
 def test_progress_at_inverts_time_to_go(law):
@@ -75,15 +75,15 @@ def test_flow_agrees_with_solve_ivp(law):
     solved = solve_ivp(
         lambda _, s: -law.speed(torch.from_numpy(s)).numpy(), (0, 2.0), starts, "LSODA", times, rtol=1e-10, atol=1e-13
     )
-    found = law.progress_at(law.time_to_go(torch.from_numpy(starts)).unsqueeze(-1) - torch.from_numpy(times))
-    assert np.abs(found.numpy() - solved.y).max() < 1e-7
+    progress = law.progress_at(law.time_to_go(torch.from_numpy(starts)).unsqueeze(-1) - torch.from_numpy(times))
+    assert np.abs(progress.numpy() - solved.y).max() < 1e-7
 
 
 def test_law_needs_its_duration():
     """From the start to the edge of the tail; the tail takes what is left."""
     assert ChebyshevLaw(3.0).time_to_go(torch.ones(1, dtype=torch.float64)).item() == pytest.approx(3.0, rel=0.03)
     uniform = PiecewiseLinearLaw.uniform(3.0).time_to_go(torch.ones(1, dtype=torch.float64)).item()
-    assert uniform == pytest.approx(3.0 * (1 - TAIL), rel=1e-12)
+    assert uniform == pytest.approx(3.0 * (1 - LINEAR_BELOW), rel=1e-12)
 
 
 def test_gradients_of_the_flow(law):

@@ -42,11 +42,11 @@ def test_there_and_back_with_the_determinant_of_autograd(psi, batch, draw):
     y = transform(x)
     assert y.shape == x.shape
     torch.testing.assert_close(transform.inv(y), x)
-    found = transform.log_abs_det_jacobian(x, y)
-    assert found.shape == batch
-    torch.testing.assert_close(transform.inv.log_abs_det_jacobian(y, x), -found)
+    log_det = transform.log_abs_det_jacobian(x, y)
+    assert log_det.shape == batch
+    torch.testing.assert_close(transform.inv.log_abs_det_jacobian(y, x), -log_det)
     rows = [torch.linalg.slogdet(torch.func.jacrev(transform)(row))[1] for row in x.reshape(-1, 3)]
-    torch.testing.assert_close(found, torch.stack(rows).reshape(batch) if rows else found)
+    torch.testing.assert_close(log_det, torch.stack(rows).reshape(batch) if rows else log_det)
 
 
 def test_what_torch_asks_of_a_transform(psi):

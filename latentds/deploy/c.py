@@ -14,8 +14,9 @@ from ..diffeomorphism import ROOT_STEPS
 from ..files import atomic_write
 from ..kernels.adjoint import NEGLIGIBLE
 from ..kernels.translations import BEYOND
-from ..time_law import TAIL
-from .tables import Array, FieldTables, VelocityField, describe, pieces, tables_of
+from ..tabulated import LawKind, LawTable
+from ..time_law import LINEAR_BELOW
+from .tables import FieldTables, VelocityField, describe, tables_of
 
 
 def write(ds: VelocityField, path: str | os.PathLike[str], *, name: str) -> None:
@@ -85,16 +86,16 @@ def _field(tables: FieldTables, name: str, real: str) -> str:
     return _FIELD.substitute(words, **text, laws=laws, steps=ROOT_STEPS)
 
 
-def _law(law: Array, key: str, words: dict[str, Any]) -> str:
-    """The function h(s)/s, see :meth:`latentds.time_law.TimeLaw.table`."""
-    if law[0, 0] < 0:
-        numbers = {"tail": np.array(TAIL), "omega": law[1, 0]}
+def _law(law: LawTable, key: str, words: dict[str, Any]) -> str:
+    """The function h(s)/s."""
+    if law.kind is LawKind.EIGENMAP:
+        numbers = {"tail": np.array(LINEAR_BELOW), "omega": law.speeds[0]}
         template = _EIGENMAP
     else:
-        numbers = {"pieces": pieces(law)}
+        numbers = {"pieces": law.pieces()}
         template = _PIECEWISE
     text = {k: _braces(value, words["f"]) for k, value in numbers.items()}
-    return template.substitute(words, **text, key=key, count=law.shape[1] + 1)
+    return template.substitute(words, **text, key=key, count=len(law.knots) + 1)
 
 
 def _braces(numbers: Any, suffix: str) -> str:

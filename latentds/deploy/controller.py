@@ -9,16 +9,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from ..arguments import number_in, positive, real_array
+from ..arguments import Array, number_in, positive, real_array
 from ..kernels.velocity import velocity_kernel
 from .tables import VelocityField
 
-Array = NDArray[np.float64]
-
-NONE: Array = np.empty((1, 0))
-"""Room for no derivatives."""
+NO_SLOPES: Array = np.empty((1, 0))
+"""Where the kernel puts derivatives when none are asked."""
 
 
 class Controller:
@@ -49,7 +46,8 @@ class Controller:
         self.max_speed = number_in(max_speed, "max_speed", 0, math.inf, ends="(]")
         self._attractor = ds.attractor.detach().to("cpu", torch.float64, copy=True).numpy()
         self._placed = np.array([*np.zeros(self.dim), 1.0, self.max_speed])  # shift, speed, limit: as the kernel has it
-        self._tables = ds.tables()
+        tables = ds.tables()
+        self._tables = None if tables is None else tables.packed()
         self._ds = copy.deepcopy(ds).requires_grad_(False) if self._tables is None else None
         self._prepare()
         self(np.zeros(self.dim))
@@ -117,7 +115,9 @@ class Controller:
                 out[...] = self._ask(torch.from_numpy(_finite(y))).numpy()
             return out
         rows = y.size // self.dim
-        if not self._kernel(*self._tables, y.reshape(rows, self.dim), out.reshape(rows, self.dim), NONE, self._room()):
+        if not self._kernel(
+            *self._tables, y.reshape(rows, self.dim), out.reshape(rows, self.dim), NO_SLOPES, self._room()
+        ):
             _finite(y)
         return out
 
@@ -161,11 +161,10 @@ class Controller:
             self._kernel = velocity_kernel(self.dim, 0)
 
     def _points(self, y: Any) -> Array:
-        if type(y) is not np.ndarray or y.dtype != np.float64 or not y.flags.c_contiguous:
-            y = _real(y)
-        if y.ndim == 0 or y.shape[-1] != self.dim:
-            raise ValueError(f"y: expected shape (..., {self.dim}), got {y.shape}")
-        return y  # type: ignore[no-any-return]
+        points = _real(y)
+        if points.ndim == 0 or points.shape[-1] != self.dim:
+            raise ValueError(f"y: expected shape (..., {self.dim}), got {points.shape}")
+        return points
 
     def _goal_of(self, goal: Any) -> Array:
         point: Array = real_array(goal, "goal")
@@ -191,7 +190,7 @@ class Controller:
             room: Array = self._local.room
         except AttributeError:
             assert self._tables is not None
-            self._local.room = room = np.empty((len(self._tables.layers) + 2 + self.dim, self.dim + 2))
+            self._local.room = room = np.empty((len(self._tables[0]) + 2 + self.dim, self.dim + 2))
         room[-1] = self._placed
         return room
 
@@ -203,10 +202,12 @@ def _finite(y: Array) -> Array:
 
 
 def _real(y: Any) -> Array:
+    """``y`` itself if it is as the kernel reads it, else a copy that is."""
     try:
         array = np.asarray(y)
         if array.dtype.kind not in "fiu":
             raise TypeError
     except (TypeError, ValueError):
         raise ValueError(f"y: expected real numbers, got {type(y).__name__}") from None
-    return np.ascontiguousarray(array, dtype=np.float64)
+    readable = array is y and array.dtype == np.float64 and array.flags.c_contiguous
+    return array if readable else np.ascontiguousarray(array, dtype=np.float64)

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..arguments import Array
 from ..diffeomorphism import ROOT_STEPS
 from ..files import atomic_write
 from ..kernels.translations import BEYOND
-from ..time_law import TAIL
-from .tables import Array, FieldTables, VelocityField, describe, pieces, tables_of
+from ..tabulated import LawKind, LawTable
+from ..time_law import LINEAR_BELOW
+from .tables import FieldTables, VelocityField, describe, tables_of
 
 try:
     from onnx import NodeProto, TensorProto, checker, helper, numpy_helper
@@ -184,13 +186,13 @@ def _push(c: _Value, v: _Value, q: _Value, a: _Value, x: _Value, tangent: _Value
     return [x + k * v, tangent + (tangent * w).sum() * (q * k) * -2.0 * v]
 
 
-def _rate(law: Array, s: _Value) -> _Value:
-    """h(s)/s, see :meth:`latentds.time_law.TimeLaw.table`."""
-    if law[0, 0] < 0:
-        s = s.op("Max", TAIL)
+def _rate(law: LawTable, s: _Value) -> _Value:
+    """h(s)/s."""
+    if law.kind is LawKind.EIGENMAP:
+        s = s.op("Max", LINEAR_BELOW)
         inside = s.op("Min", 1.0)
-        return ((inside * -1.0 + 2.0) / inside).op("Sqrt") * (inside / s) * float(law[1, 0])
+        return ((inside * -1.0 + 2.0) / inside).op("Sqrt") * (inside / s) * float(law.speeds[0])
     s = s.op("Max", np.finfo(np.float64).tiny ** 0.25)  # far inside the tail, where h(s)/s no longer changes
-    index = s.op("Greater", law[0]).op("Cast", to=TensorProto.INT64).sum()
-    start, speed, slope = (s.graph.constant(part).op("Gather", index) for part in pieces(law))
-    return (speed + (s.op("Min", law[0, -1]) - start) * slope) / s
+    index = s.op("Greater", law.knots).op("Cast", to=TensorProto.INT64).sum()
+    start, speed, slope = (s.graph.constant(part).op("Gather", index) for part in law.pieces())
+    return (speed + (s.op("Min", law.knots[-1]) - start) * slope) / s

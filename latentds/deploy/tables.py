@@ -7,13 +7,13 @@ import re
 from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
+from ..arguments import Array
 from ..diffeomorphism import Diffeomorphism
 from ..dynamics import Frame, LatentDynamics
+from ..tabulated import LawTable
 
-Array = NDArray[np.float64]
 Self = TypeVar("Self", bound="VelocityField")
 
 
@@ -24,10 +24,14 @@ class FieldTables(NamedTuple):
     """(M, 2n+2) a row (c, v, ρ², ρ²‖v‖²) per layer, first to last"""
     goal: Array
     """(3, n) x*, the axis u (zeros: all of the offset counts as across), and the length ℓ in each entry"""
-    along: Array
-    """(2, m) the time law along the axis, see :meth:`latentds.time_law.TimeLaw.table`"""
-    across: Array
-    """(2, m) the time law across it"""
+    along: LawTable
+    """the time law along the axis"""
+    across: LawTable
+    """the time law across it"""
+
+    def packed(self) -> tuple[Array, Array, Array, Array]:
+        """As the velocity kernel takes them."""
+        return self.layers, self.goal, self.along.packed(), self.across.packed()
 
 
 class VelocityField(Protocol):
@@ -52,14 +56,14 @@ def tables_of(ds: VelocityField) -> FieldTables:
     tables = ds.tables()
     if tables is None:
         psi, dynamics, frame = (getattr(ds, name, None) for name in ("diffeomorphism", "dynamics", "frame"))
-        if isinstance(psi, Diffeomorphism) and psi.layer_table() is None:
-            missing = f"its diffeomorphism {type(psi).__name__} has no layer_table()"
-        elif isinstance(dynamics, LatentDynamics) and frame is not None and dynamics.tables(frame()) is None:
-            missing = f"its dynamics {type(dynamics).__name__}, or a time law of theirs, have no tables()"
+        if isinstance(psi, Diffeomorphism) and psi.table() is None:
+            missing = f"its diffeomorphism {type(psi).__name__} has no table()"
+        elif isinstance(dynamics, LatentDynamics) and frame is not None and dynamics.table(frame()) is None:
+            missing = f"its dynamics {type(dynamics).__name__}, or a time law of theirs, have no table()"
         else:
             missing = "its velocity is its own, and its tables() do not say how to write it"
         raise ValueError(f"ds: expected a system that can be written as tables, got {type(ds).__name__}: {missing}")
-    if not all(np.isfinite(table).all() for table in tables):
+    if not all(np.isfinite(table).all() for table in tables.packed()):
         raise ValueError(f"ds: expected finite parameters, got {type(ds).__name__} with NaN or inf")
     return tables
 
@@ -68,7 +72,7 @@ def describe(ds: VelocityField) -> dict[str, str]:
     """What an exported file says of the system it was made of, in printable ASCII."""
     learned_from = getattr(getattr(ds, "fit_report", None), "learned_from", ())
     shown = ", ".join(f"{name or 'unnamed'} (SHA-256 {digest})" for name, digest in learned_from)
-    told = {
+    entries = {
         "method": type(ds).__name__,
         "dim": str(ds.dim),
         "goal": ", ".join(repr(float(value)) for value in ds.attractor),
@@ -76,16 +80,10 @@ def describe(ds: VelocityField) -> dict[str, str]:
         "learned from": shown or "nothing: not fitted",
         "written": datetime.date.today().isoformat(),
     }
-    return {key: re.sub(r"[^ -~]|[*?/\\]", "_", text) for key, text in told.items()}  # harmless in a C comment too
-
-
-def pieces(law: Array) -> Array:
-    """A time law of knots and speeds as pieces from 0 on, the last one without end: (3, m+1) starts, speeds, slopes."""
-    starts, speeds = np.insert(law, 0, 0.0, axis=1)
-    return np.stack([starts, speeds, np.append(np.diff(speeds) / np.diff(starts), 0.0)])
+    return {key: re.sub(r"[^ -~]|[*?/\\]", "_", text) for key, text in entries.items()}  # harmless in a C comment too
 
 
 def field_tables(psi: Diffeomorphism, dynamics: LatentDynamics, frame: Frame) -> FieldTables | None:
     """The field J_ψ(x) g(x), x = ψ⁻¹(y), as arrays; None where one of the two cannot be written so."""
-    layers, moves = psi.layer_table(), dynamics.tables(frame)
+    layers, moves = psi.table(), dynamics.table(frame)
     return None if layers is None or moves is None else FieldTables(layers, *moves)

@@ -6,26 +6,24 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arguments import Array
 from .compiling import compiled
 from .lanes import WIDTH, anywhere, exp, load, store, where
-
-Array = NDArray[np.float64]
 
 NEGLIGIBLE = 60.0
 """ρ²‖x-c‖² from which a layer moves a point by less than exp(-60) = 9e-27 of its translation: it is skipped."""
 
 ROWS = 32
-"""Points that go through the layers together: what a layer has to keep of them on the way there fits the L2 cache."""
+"""Points that go through the layers together: what the way there keeps of them for the way back fits the L2 cache."""
 
 
 @cache
 def forward_adjoint(dim: int, tangents: int) -> Any:
-    """Of ψ and J_ψ: from dloss/dψ(x) and dloss/d(J_ψ t) to those of points, tangents and layers.
+    """The kernel from dloss/dψ(x) and dloss/d(J_ψ t) to the gradients by points, tangents and layers.
 
     x and x_out are (m, n), gx (m, n) or (1, n); t is (m, n·T) or (1, n·T), gt and t_out (m, n·T). ``sums``
-    (M, 8·(2n+1)) takes, for each layer, what to add up over eight lanes for c, v and ρ².
+    (M, 8·(2n+1)) receives each layer's gradient by c, v and ρ², in eight parts that the caller adds up.
     """
     entries = 2 * dim + 1
 
@@ -132,9 +130,9 @@ def forward_adjoint(dim: int, tangents: int) -> Any:
 
 @cache
 def inverse_adjoint(dim: int) -> Any:
-    """Of ψ⁻¹: from x = ψ⁻¹(y) and dloss/dx (m, n) to dloss/dy (m, n) and, into ``sums``, those of the layers.
+    """The kernel from dloss/dx at x = ψ⁻¹(y) to dloss/dy, both (m, n), and to the layers' gradients, in ``sums``.
 
-    It climbs from x through the layers, so that no root is sought: there (I + v ∇kᵀ) dx = dy - k dv - v (∂k).
+    It goes from x through the layers towards y, so that no root has to be found: (I + v ∇kᵀ) dx = dy - k dv - v ∂k.
     """
     entries = 2 * dim + 1
 
@@ -161,12 +159,12 @@ def inverse_adjoint(dim: int) -> Any:
                         continue
                     k = exp(distance * -q)
                     slope = -2.0 * q * k
-                    along, swell = k * 0.0, k * 0.0 + 1.0
+                    along, growth = k * 0.0, k * 0.0 + 1.0
                     for d in range(dim):
                         w = load(held, d * ROWS + u, WIDTH) - layers[j, d]
                         along = along + load(held, at_g + d * ROWS + u, WIDTH) * layers[j, dim + d]
-                        swell = swell + where(k > 0.0, slope * w, k) * layers[j, dim + d]
-                    beta = along / swell
+                        growth = growth + where(k > 0.0, slope * w, k) * layers[j, dim + d]
+                    beta = along / growth
                     for d in range(dim):
                         moved = load(held, d * ROWS + u, WIDTH)
                         change = beta * where(k > 0.0, slope * (moved - layers[j, d]), k)

@@ -13,11 +13,13 @@ from typing import Any
 
 import numba
 
+from .private import stamp_cache
+
 OPTIONS: dict[str, Any] = {"nogil": True, "fastmath": {"contract"}, "error_model": "numpy"}
 
 
 def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """``numba.njit`` with its cache on disk, or without where no place for one can be written (a read-only install)."""
+    """``numba.njit`` with its cache on disk; without one where none can be written, as in a read-only install."""
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:
@@ -25,7 +27,7 @@ def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         except RuntimeError:
             return numba.njit(**options)(function)
         # Numba asks only for the age of the file that defines a function; ours inline each other across files.
-        kernel._cache._cache_file._source_stamp = _sources(inspect.getfile(function))
+        stamp_cache(kernel, _sources(inspect.getfile(function)))
         return kernel
 
     return decorate
@@ -33,7 +35,7 @@ def cached(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 @cache
 def _sources(file: str) -> str:
-    """A hash of what machine code made from a file depends on: its content, and that of this package."""
+    """A hash of what the machine code of a file's functions depends on: that file and the files of this package."""
     digest = hashlib.sha256()
     for path in sorted({Path(file), *Path(__file__).parent.glob("*.py")}):
         digest.update(path.read_bytes())

@@ -6,26 +6,28 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arguments import Array
 from .compiling import compiled
 from .lanes import WIDTH, exp, load, store, where
-
-Array = NDArray[np.float64]
 
 
 @cache
 def greedy_kernel() -> Any:
-    """The greedy match of :func:`latentds.fitting.matching.match`; moves ``moved`` in place.
+    """The greedy match of :func:`latentds.fitting.matching.match`.
 
-    (moved, y: (N, n); β, μ²e/2, largest ρ²; the point to move, -1 for the one with the largest error; layers
-    (M, 2n+1) to fill with (c, v, ρ²)) -> layers filled. The loss of a layer, ‖v‖² Σ k² - 2 a k with k = exp(-ρ²d) and
-    a = error·v/‖v‖², is evaluated on a grid of ρ² with ratio √2 from the bound down to where every k is near 1:
-    doubling ρ² squares k, so the grid costs two exponentials a point. From the best of the grid, Newton's method
-    inside a bracket, with exact exponentials.
+    It moves the points ``moved`` (N, n) towards ``y`` (N, n) in place, fills ``layers`` (M, 2n+1) with rows (c, v, ρ²)
+    and returns how many it filled. ``beta`` is β, ``bound`` μ²e/2; each layer lies on the point ``at``, or on the one
+    with the largest error if that is -1.
+
+    The loss of a layer, ‖v‖² Σ k² - 2 a k with k = exp(-ρ²d) and a = error·v/‖v‖², is evaluated on a grid of ρ² with
+    ratio √2, from the bound down to where every k is near 1. Doubling ρ² squares k, so that the grid costs two
+    exponentials a point. From the best of the grid Newton's method goes on inside a bracket, with exact exponentials.
     """
 
-    def greedy(moved: Array, y: Array, beta: float, bound: float, narrowest: float, at: int, layers: Array) -> int:
+    def greedy(
+        moved: Array, y: Array, beta: float, bound: float, largest_rho_squared: float, at: int, layers: Array
+    ) -> int:
         count, dim = moved.shape
         padded = (count + WIDTH - 1) // WIDTH * WIDTH
         x, error = np.zeros(dim * padded), np.zeros(dim * padded)
@@ -65,7 +67,7 @@ def greedy_kernel() -> Any:
             for i in range(count):
                 farthest = max(farthest, d[i])
             # The grid: two chains, q and q√2, doubled until q√2 reaches the bound.
-            limit = min(bound / size, narrowest)
+            limit = min(bound / size, largest_rho_squared)
             doublings = max(0, int(np.ceil(np.log2(max(16.0 * limit * farthest, 1.0)))))
             first = 0.5 * limit * 0.5**doublings
             for i in range(count, padded):

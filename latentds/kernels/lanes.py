@@ -15,13 +15,11 @@ from typing import Any
 import numba
 from llvmlite import ir
 from numba import types
-from numba.core.datamodel import models, register_default
-from numba.core.imputils import lower_builtin, lower_cast
-from numba.core.typeconv import Conversion
-from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic as _intrinsic
+from numba.extending import lower_builtin, lower_cast, models, register_model
 
 from .compiling import OPTIONS
+from .private import AbstractTemplate, Conversion, infer_global, signature
 
 intrinsic: Any = _intrinsic
 WIDTH = 8
@@ -47,13 +45,13 @@ lanes, mask = _Lanes(), _Mask()
 _VECTOR, _BITS, _MASK = (ir.VectorType(kind, WIDTH) for kind in (ir.DoubleType(), ir.IntType(64), ir.IntType(1)))
 
 
-@register_default(_Lanes)
+@register_model(_Lanes)
 class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _VECTOR)
 
 
-@register_default(_Mask)
+@register_model(_Mask)
 class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]
     def __init__(self, manager: Any, kind: Any) -> None:
         super().__init__(manager, kind, _MASK)

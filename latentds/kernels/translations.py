@@ -1,31 +1,28 @@
 """Compiled CPU kernels behind locally weighted translations.
 
 A kernel takes points in blocks, held coordinate by coordinate in the L1 cache, sends a block through all layers and
-carries eight points at a time through the arithmetic (:mod:`latentds.kernels.lanes`). Layers that move no point of a
-vector by a rounding error are skipped for it. Everything is computed in float64: a float32 module gets its answer
+carries eight points at a time through the arithmetic (:mod:`latentds.kernels.lanes`). A layer is skipped for eight
+points that it moves by less than a rounding error. Everything is computed in float64: a float32 module gets its answer
 rounded.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, partial
 from typing import Any
 
 import numba
 import numpy as np
-import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from ..arguments import Array
 from . import dispatch
 from .adjoint import NEGLIGIBLE, forward_adjoint, inverse_adjoint
 from .compiling import OPTIONS, compiled
-from .dispatch import BLOCK, evaluate, is_plain, no_active_transforms, rows_of, run, tensor_of
+from .dispatch import BLOCK, rows_of, run, tensor_of
 from .lanes import WIDTH, anywhere, either, exp, load, store, where
-
-Array = NDArray[np.float64]
 
 PARAMETERS = ("centers", "log_widths", "strengths")
 """Of the module, in the order in which the kernels take them."""
@@ -36,52 +33,36 @@ BEYOND = 80.0
 can_use_kernel = partial(dispatch.can_use_kernel, PARAMETERS)
 
 
-def forward(module: Any, x: Tensor) -> Tensor:
-    """ψ of a :class:`~latentds.LocallyWeightedTranslations`; so are those below."""
-    layers = layers_of(module)
-    adjoint = partial(_forward_adjoint, layers)
-    return evaluate(partial(_forward, layers), adjoint, type(module).forward, PARAMETERS, module, x)
+def forward(layers: Array, x: Tensor) -> Tensor:
+    """ψ(x); this and the three below take layers as :func:`packed` gives them, and plain tensors."""
+    return tensor_of(_swept(layers, rows_of(x), np.empty((1, 0)), 0)[0], x, x.shape)
 
 
-def inverse(module: Any, y: Tensor) -> Tensor:
-    layers = layers_of(module)
-    adjoint = partial(_inverse_adjoint, layers)
-    return evaluate(partial(_inverse, layers), adjoint, type(module).inverse, PARAMETERS, module, y)
-
-
-def jacobian(module: Any, x: Tensor) -> Tensor:
-    layers = layers_of(module)
-    adjoint = partial(_jacobian_adjoint, layers)
-    return evaluate(partial(_jacobian, layers), adjoint, type(module).jacobian, PARAMETERS, module, x)
-
-
-def linearize(module: Any, y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
-    layers, x = layers_of(module), inverse(module, y)
-
-    def push(tangent: Tensor) -> Tensor:
-        if not (no_active_transforms() and is_plain(tangent, x.dtype)):
-            return _pushed(module, x, tangent)
-        points, tangents = torch.broadcast_tensors(x, tangent)  # type: ignore[no-untyped-call]
-        adjoint = partial(_push_adjoint, layers)
-        return evaluate(partial(_push, layers), adjoint, _pushed, PARAMETERS, module, points, tangents)
-
-    return x, push
-
-
-def _pushed(module: Any, x: Tensor, tangent: Tensor) -> Tensor:
-    moved: Tensor = module.jacobian(x) @ tangent.unsqueeze(-1)
-    return moved.squeeze(-1)
-
-
-def _forward(layers: Array, x: Tensor) -> Tensor:
-    return tensor_of(_moved(layers, rows_of(x)), x, x.shape)
-
-
-def _moved(layers: Array, points: Array) -> Array:
+def inverse(layers: Array, y: Tensor) -> Tensor:
+    """ψ⁻¹(y)."""
+    points = rows_of(y)
     out = np.empty_like(points)
-    kernel = partial(forward_kernel, points.shape[1], 0)
-    run(kernel, layers, points, np.empty((1, 0)), out, np.empty((len(points), 0)))
-    return out
+    run(partial(inverse_kernel, points.shape[1]), layers, points, out)
+    return tensor_of(out, y, y.shape)
+
+
+def push(layers: Array, x: Tensor, tangent: Tensor) -> Tensor:
+    """J_ψ(x) t."""
+    return tensor_of(_swept(layers, rows_of(x), rows_of(tangent), 1)[1], x, x.shape)
+
+
+def jacobian(layers: Array, x: Tensor) -> Tensor:
+    """J_ψ(x)."""
+    dim = x.shape[-1]
+    return tensor_of(_swept(layers, rows_of(x), np.eye(dim).reshape(1, -1), dim)[1], x, (*x.shape, dim))
+
+
+def _swept(layers: Array, points: Array, tangents: Array, n_tangents: int) -> tuple[Array, Array]:
+    """ψ of points (m, n), and J_ψ of so many tangents at each, (m, n·T) or (1, n·T)."""
+    count, dim = points.shape
+    moved, pushed = np.empty_like(points), np.empty((count, dim * n_tangents))
+    run(partial(forward_kernel, dim, n_tangents), layers, points, tangents, moved, pushed)
+    return moved, pushed
 
 
 def forward_and_adjoint(layers: Array, points: Array) -> tuple[Array, Callable[[Array], Array]]:
@@ -92,62 +73,49 @@ def forward_and_adjoint(layers: Array, points: Array) -> tuple[Array, Callable[[
         kernel = forward_adjoint(points.shape[1], 0)
         return _summed(kernel, layers, points, nothing, of_moved, nothing, np.empty_like(points), nothing)
 
-    return _moved(layers, points), adjoint
+    return _swept(layers, points, np.empty((1, 0)), 0)[0], adjoint
 
 
-def _inverse(layers: Array, y: Tensor) -> Tensor:
-    points = rows_of(y)
-    out = np.empty_like(points)
-    run(partial(inverse_kernel, points.shape[1]), layers, points, out)
-    return tensor_of(out, y, y.shape)
+Gradients = tuple[tuple[Tensor, ...], Array]
+"""dloss/dpoints, and dloss/d(c, v, ρ²) of every layer (M, 2n+1)."""
 
 
-def _push(layers: Array, x: Tensor, tangent: Tensor) -> Tensor:
-    points, tangents = rows_of(x), rows_of(tangent)
-    moved, out = np.empty_like(points), np.empty_like(tangents)
-    run(partial(forward_kernel, points.shape[1], 1), layers, points, tangents, moved, out)
-    return tensor_of(out, x, x.shape)
-
-
-def _jacobian(layers: Array, x: Tensor) -> Tensor:
-    points, dim = rows_of(x), x.shape[-1]
-    moved, out = np.empty_like(points), np.empty((len(points), dim * dim))
-    run(partial(forward_kernel, dim, dim), layers, points, np.eye(dim).reshape(1, -1), moved, out)
-    return tensor_of(out, x, (*x.shape, dim))
-
-
-def _forward_adjoint(layers: Array, gradient: Tensor, value: Tensor, x: Tensor) -> Any:
+def forward_gradients(layers: Array, gradient: Tensor, value: Tensor, x: Tensor) -> Gradients:
+    """Of a loss through :func:`forward`, from its gradient by the value; the three below are those of the others."""
     nothing = np.empty((value[..., 0].numel(), 0))
-    of_x, _, through = _adjoint(layers, x, np.empty((1, 0)), rows_of(gradient), nothing)
-    return (tensor_of(of_x, x, x.shape),), through
+    of_x, _, of_layers = _pulled_back(layers, x, np.empty((1, 0)), rows_of(gradient), nothing)
+    return (tensor_of(of_x, x, x.shape),), of_layers
 
 
-def _push_adjoint(layers: Array, gradient: Tensor, value: Tensor, x: Tensor, tangent: Tensor) -> Any:
-    of_x, of_tangent, through = _adjoint(layers, x, rows_of(tangent), np.zeros((1, x.shape[-1])), rows_of(gradient))
-    return (tensor_of(of_x, x, x.shape), tensor_of(of_tangent, x, x.shape)), through
-
-
-def _jacobian_adjoint(layers: Array, gradient: Tensor, value: Tensor, x: Tensor) -> Any:
-    dim = x.shape[-1]
-    of_tangents = rows_of(gradient.flatten(-2))
-    of_x, _, through = _adjoint(layers, x, np.eye(dim).reshape(1, -1), np.zeros((1, dim)), of_tangents)
-    return (tensor_of(of_x, x, x.shape),), through
-
-
-def _adjoint(layers: Array, x: Tensor, tangents: Array, of_x: Array, of_tangents: Array) -> tuple[Array, Array, Any]:
-    """From the gradients of ψ(x) and of the pushed tangents to those of x, the tangents and the layers."""
-    points, dim = rows_of(x), x.shape[-1]
-    found, of_given = np.empty_like(points), np.empty_like(of_tangents)
-    kernel = forward_adjoint(dim, of_tangents.shape[1] // dim)
-    sums = _summed(kernel, layers, points, tangents, of_x, of_tangents, found, of_given)
-    return found, of_given, partial(_of_layers, sums)
-
-
-def _inverse_adjoint(layers: Array, gradient: Tensor, value: Tensor, y: Tensor) -> Any:
+def inverse_gradients(layers: Array, gradient: Tensor, value: Tensor, y: Tensor) -> Gradients:
     points = rows_of(value)
-    found = np.empty_like(points)
-    sums = _summed(inverse_adjoint(points.shape[1]), layers, points, rows_of(gradient), found)
-    return (tensor_of(found, y, y.shape),), partial(_of_layers, sums)
+    of_y = np.empty_like(points)
+    of_layers = _summed(inverse_adjoint(points.shape[1]), layers, points, rows_of(gradient), of_y)
+    return (tensor_of(of_y, y, y.shape),), of_layers
+
+
+def push_gradients(layers: Array, gradient: Tensor, value: Tensor, x: Tensor, tangent: Tensor) -> Gradients:
+    of_image = np.zeros((1, x.shape[-1]))
+    of_x, of_tangent, of_layers = _pulled_back(layers, x, rows_of(tangent), of_image, rows_of(gradient))
+    return (tensor_of(of_x, x, x.shape), tensor_of(of_tangent, x, x.shape)), of_layers
+
+
+def jacobian_gradients(layers: Array, gradient: Tensor, value: Tensor, x: Tensor) -> Gradients:
+    dim = x.shape[-1]
+    of_columns = rows_of(gradient.flatten(-2))
+    of_x, _, of_layers = _pulled_back(layers, x, np.eye(dim).reshape(1, -1), np.zeros((1, dim)), of_columns)
+    return (tensor_of(of_x, x, x.shape),), of_layers
+
+
+def _pulled_back(
+    layers: Array, x: Tensor, tangents: Array, of_image: Array, of_pushed: Array
+) -> tuple[Array, Array, Array]:
+    """From the gradients of ψ(x) and of the pushed tangents to those of x, of the tangents and of the layers."""
+    points, dim = rows_of(x), x.shape[-1]
+    of_points, of_tangents = np.empty_like(points), np.empty_like(of_pushed)
+    kernel = forward_adjoint(dim, of_pushed.shape[1] // dim)
+    of_layers = _summed(kernel, layers, points, tangents, of_image, of_pushed, of_points, of_tangents)
+    return of_points, of_tangents, of_layers
 
 
 def _summed(kernel: Callable[..., None], layers: Array, points: Array, *by_row: Array) -> Array:
@@ -164,31 +132,24 @@ def _summed(kernel: Callable[..., None], layers: Array, points: Array, *by_row: 
             parts.append((points[cut:].ctypes.data, sums.sum(-1)))
 
     run(lambda block: sweep, layers, points, *by_row)
-    # block by block and in the order of the points: to the last bit the same on any number of cores
+    # Block by block in the order of the points, so that the sum is the same to the last bit on any number of cores.
     total = np.zeros(shape[:2])
     for _, part in sorted(parts, key=lambda part: part[0]):
         total += part
     return total + (math.nan if np.isnan(points.sum()) else 0.0)  # as on the torch path
 
 
-def _of_layers(sums: Array, module: Any) -> tuple[Tensor, Tensor]:
-    """What the parameters make of each layer, a row (c, v, ρ²), and its gradient."""
-    squares = torch.exp(2 * module.log_widths).unsqueeze(-1)
-    made = torch.cat([module.centers, module.directions, squares], dim=-1)
-    return made, torch.from_numpy(sums).to(made)
-
-
-def layers_of(module: Any) -> Array:
-    """The layers as the kernels read them, a row (c, v, ρ², ρ²‖v‖²) each: (M, 2n+2).
+def packed(parameters: Sequence[Tensor]) -> Array:
+    """The layers that these parameters make, as the kernels read them: a row (c, v, ρ², ρ²‖v‖²) each, (M, 2n+2).
 
     Made anew for every call, in some microseconds, so that it is never stale.
     """
-    arrays = [module._parameters[name].detach().numpy() for name in PARAMETERS]  # type: ignore[union-attr]
-    return pack_kernel()(*(np.ascontiguousarray(a, dtype=np.float64) for a in arrays))  # type: ignore[no-any-return]
+    arrays = (np.ascontiguousarray(parameter.detach().numpy(), dtype=np.float64) for parameter in parameters)
+    return pack_kernel()(*arrays)  # type: ignore[no-any-return]
 
 
 @numba.njit(inline="always", **OPTIONS)  # type: ignore[untyped-decorator]
-def _doubt(x: float) -> float:
+def nan_or_zero(x: float) -> float:
     """0, or NaN of NaN: a row with one is NaN in all coordinates, as on the torch path."""
     return x if np.isnan(x) else 0.0
 
@@ -297,13 +258,13 @@ def forward_kernel(dim: int, tangents: int, block: int) -> Any:
                         place = (d + 1) * block + u
                         store(held, place, load(held, place, width) + k * layers[j, dim + d])
             for i in range(count):
-                doubt = 0.0  # or not a number, as soon as one coordinate is
+                spoilt = 0.0  # NaN if one coordinate is
                 for d in range(dim):
-                    doubt += _doubt(held[(d + 1) * block + i])
+                    spoilt += nan_or_zero(held[(d + 1) * block + i])
                 for d in range(dim):
-                    x_out[begin + i, d] = held[(d + 1) * block + i] + doubt
+                    x_out[begin + i, d] = held[(d + 1) * block + i] + spoilt
                 for e in range(dim * tangents):
-                    t_out[begin + i, e] = held[first_tangent + e * block + i] + doubt
+                    t_out[begin + i, e] = held[first_tangent + e * block + i] + spoilt
 
     return compiled(sweep, _signature(5))
 
@@ -377,11 +338,11 @@ def inverse_kernel(dim: int, block: int) -> Any:
                         place = at_x + d * block + u
                         store(held, place, load(held, place, width) - s * layers[j, dim + d])
             for i in range(count):
-                doubt = 0.0
+                spoilt = 0.0
                 for d in range(dim):
-                    doubt += _doubt(held[at_x + d * block + i])
+                    spoilt += nan_or_zero(held[at_x + d * block + i])
                 for d in range(dim):
-                    x_out[begin + i, d] = held[at_x + d * block + i] + doubt
+                    x_out[begin + i, d] = held[at_x + d * block + i] + spoilt
 
     return compiled(inverse, _signature(3))
 

@@ -7,13 +7,14 @@ from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from ..time_law import TAIL
+from ..arguments import Array
+from ..tabulated import LawKind
+from ..time_law import LINEAR_BELOW
 from .compiling import OPTIONS, compiled
 from .translations import BEYOND, first_root, next_root
 
-Array = NDArray[np.float64]
+_EIGENMAP = float(LawKind.EIGENMAP)
 
 
 @cache
@@ -21,8 +22,8 @@ def velocity_kernel(dim: int, tangents: int) -> Any:
     """The velocity J_ψ(x) g(x), x = ψ⁻¹(y - shift), of points one by one: (m, n) -> (m, n); False if one is not finite.
 
     ``goal`` (3, n) holds x*, the axis u and the length ℓ in each entry; with o = (x - x*)/ℓ, a = u·o and p = o - a u,
-    g = -ℓ (rate(|a|) a u + rate(|p|) p), the rates h(s)/s by the tables ``along`` and ``across``: (2, m) knots and
-    speeds, or the knot -1 and ω for the eigenmap's law. It is then made ``speed`` times as long, or shortened to
+    g = -ℓ (rate(|a|) a u + rate(|p|) p), the rates h(s)/s by the laws ``along`` and ``across``, as
+    :meth:`latentds.tabulated.LawTable.packed` gives them. It is then made ``speed`` times as long, or shortened to
     ``limit``. ``slopes`` (m, n·tangents) takes the derivatives by the first ``tangents`` coordinates of y, row by row.
 
     ``room`` (M+2+tangents, n+2) keeps each layer's tangent map, then x, then tangents of x; its last row is given: the
@@ -138,30 +139,35 @@ def velocity_kernel(dim: int, tangents: int) -> Any:
 
 
 @numba.njit(inline="always", **OPTIONS)  # type: ignore[untyped-decorator]
-def _rate(table: Array, s: Any) -> Any:
-    """h(s)/s of the laws in :mod:`latentds.time_law`."""
-    if table[0, 0] < 0.0:
-        s = max(s, TAIL)
-        return table[1, 0] * (np.sqrt((2.0 - s) / s) if s < 1.0 else 1.0 / s)
-    last = table.shape[1] - 1
-    if s <= table[0, 0]:
-        return table[1, 0] / table[0, 0]
-    if s >= table[0, last]:
-        return table[1, last] / s
-    i = np.searchsorted(table[0], s)
-    share = (s - table[0, i - 1]) / (table[0, i] - table[0, i - 1])
-    return (table[1, i - 1] + share * (table[1, i] - table[1, i - 1])) / s
+def _is_eigenmap(law: Array) -> Any:
+    return law[0, 0] == _EIGENMAP
 
 
 @numba.njit(inline="always", **OPTIONS)  # type: ignore[untyped-decorator]
-def _slope(table: Array, s: Any) -> Any:
+def _rate(law: Array, s: Any) -> Any:
+    """h(s)/s of the laws in :mod:`latentds.time_law`."""
+    knots, speeds, last = law[1], law[2], law.shape[1] - 1
+    if _is_eigenmap(law):
+        s = max(s, LINEAR_BELOW)
+        return speeds[0] * (np.sqrt((2.0 - s) / s) if s < 1.0 else 1.0 / s)
+    if s <= knots[0]:
+        return speeds[0] / knots[0]
+    if s >= knots[last]:
+        return speeds[last] / s
+    i = np.searchsorted(knots, s)
+    share = (s - knots[i - 1]) / (knots[i] - knots[i - 1])
+    return (speeds[i - 1] + share * (speeds[i] - speeds[i - 1])) / s
+
+
+@numba.njit(inline="always", **OPTIONS)  # type: ignore[untyped-decorator]
+def _slope(law: Array, s: Any) -> Any:
     """h'(s) of them; at a knot, that of the side where s is smaller."""
-    last = table.shape[1] - 1
-    if s <= (TAIL if table[0, 0] < 0.0 else table[0, 0]):
-        return _rate(table, s)
-    if table[0, 0] < 0.0:
-        return table[1, 0] * (1.0 - s) / np.sqrt(s * (2.0 - s)) if s < 1.0 else 0.0
-    if s > table[0, last]:
+    knots, speeds, last = law[1], law[2], law.shape[1] - 1
+    if s <= (LINEAR_BELOW if _is_eigenmap(law) else knots[0]):
+        return _rate(law, s)
+    if _is_eigenmap(law):
+        return speeds[0] * (1.0 - s) / np.sqrt(s * (2.0 - s)) if s < 1.0 else 0.0
+    if s > knots[last]:
         return 0.0
-    i = np.searchsorted(table[0], s)
-    return (table[1, i] - table[1, i - 1]) / (table[0, i] - table[0, i - 1])
+    i = np.searchsorted(knots, s)
+    return (speeds[i] - speeds[i - 1]) / (knots[i] - knots[i - 1])

@@ -63,8 +63,8 @@ class TestAgainstAutograd:
             gradients = torch.autograd.grad((results * weights.to(dtype)).sum(), [given, *module.parameters()])
             return [results.detach(), *gradients]
 
-        found = outcome(psi, psi.compiled_linearize(), torch.float32)
-        for got, wanted in zip(found, outcome(exact, exact.linearize, torch.float64), strict=True):
+        compiled = outcome(psi, psi.compiled_linearize(), torch.float32)
+        for got, wanted in zip(compiled, outcome(exact, exact.linearize, torch.float64), strict=True):
             gap = 2e-5 * float(wanted.abs().max()) if wanted.numel() else 0
             torch.testing.assert_close(got.double(), wanted, rtol=0, atol=gap)
 

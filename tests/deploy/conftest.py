@@ -66,12 +66,12 @@ def positions(draw):
 def assert_same_velocity():
     """Equal up to a share of the largest speed."""
 
-    def check(found, ds, points, limit):
+    def check(velocities, ds, points, limit):
         with torch.no_grad():
             expected = ds(points)
-        assert found.shape == expected.shape
+        assert velocities.shape == expected.shape
         assert torch.isfinite(expected).all()
-        error = (torch.as_tensor(found, dtype=torch.float64) - expected.double()).abs().max()
+        error = (torch.as_tensor(velocities, dtype=torch.float64) - expected.double()).abs().max()
         assert error <= limit * torch.linalg.vector_norm(expected.double(), dim=-1).max()
 
     return check
@@ -87,8 +87,8 @@ def assert_spoils_its_row_alone(positions):
         spoiled = {4: np.nan, 7: np.inf, 12: -np.inf}
         for row, bad in spoiled.items():
             points[row, row % ds.dim] = bad
-        found = run(ds, points)
-        assert np.isnan(found[list(spoiled)]).all()
-        assert np.array_equal(np.delete(found, list(spoiled), 0), np.delete(expected, list(spoiled), 0))
+        velocities = run(ds, points)
+        assert np.isnan(velocities[list(spoiled)]).all()
+        assert np.array_equal(np.delete(velocities, list(spoiled), 0), np.delete(expected, list(spoiled), 0))
 
     return check

@@ -69,13 +69,13 @@ def test_equal_for_every_law(dim, dynamics, make_field, positions, run, assert_s
 def test_float_errs_as_a_rounding_of_the_position_would(dynamics, make_field, positions, run):
     ds = make_field(3, dynamics)
     points = positions(ds).float()
-    found = torch.from_numpy(run(ds, points)).double()
+    velocities = torch.from_numpy(run(ds, points)).double()
     y = points.double()
     with torch.no_grad():
         expected, jacobians = ds(y), torch.func.vmap(torch.func.jacfwd(ds))(y)
         rounding = jacobians.norm(dim=(1, 2)) * y.norm(dim=-1) * torch.finfo(torch.float32).eps / 2
         largest = expected.norm(dim=-1).max()
-        assert ((found - expected).norm(dim=-1) <= 3 * rounding + 1e-6 * largest).all()
+        assert ((velocities - expected).norm(dim=-1) <= 3 * rounding + 1e-6 * largest).all()
 
 
 def test_ten_thousand_points(make_field, positions, run, assert_same_velocity):
@@ -94,9 +94,11 @@ def test_at_rest_and_very_far(dynamics, make_field, run):
     far = {torch.float64: 1e200, torch.float32: 1e30}
     for dtype, distance in far.items():
         near = ds.attractor.to(dtype)
-        found = run(ds, torch.stack([near, near + torch.finfo(dtype).tiny, torch.full((2,), distance, dtype=dtype)]))
-        assert np.abs(found[:2]).max() < {torch.float64: 1e-9, torch.float32: 1e-3}[dtype]
-        assert np.isfinite(found).all()
+        velocities = run(
+            ds, torch.stack([near, near + torch.finfo(dtype).tiny, torch.full((2,), distance, dtype=dtype)])
+        )
+        assert np.abs(velocities[:2]).max() < {torch.float64: 1e-9, torch.float32: 1e-3}[dtype]
+        assert np.isfinite(velocities).all()
 
 
 def test_in_place(make_field, positions, run):

@@ -150,8 +150,8 @@ def test_threads_do_not_disturb_each_other():
     controller, points = ds.controller(), around(shown)
     expected = controller(points)
     with ThreadPoolExecutor(8) as pool:
-        found = list(pool.map(controller, np.tile(points, (20, 1))))
-    np.testing.assert_array_equal(found, np.tile(expected, (20, 1)))
+        velocities = list(pool.map(controller, np.tile(points, (20, 1))))
+    np.testing.assert_array_equal(velocities, np.tile(expected, (20, 1)))
 
 
 def test_nothing_piles_up():
@@ -196,9 +196,9 @@ def test_jacobian_is_that_of_the_system(make, dim):
     points, controller = around(shown, 20)[2:], ds.controller()  # not where s = 1: laws have a kink there
     wanted = autograd(ds, points)
     scale = np.abs(wanted).max(axis=(1, 2), keepdims=True)
-    found = controller.jacobian(points)
-    assert (np.abs(found - wanted) <= 1e-7 * scale + 1e-9).all()
-    np.testing.assert_allclose(controller.jacobian(points[3]), found[3], rtol=1e-9, atol=1e-12)
+    jacobians = controller.jacobian(points)
+    assert (np.abs(jacobians - wanted) <= 1e-7 * scale + 1e-9).all()
+    np.testing.assert_allclose(controller.jacobian(points[3]), jacobians[3], rtol=1e-9, atol=1e-12)
     assert controller.jacobian(points[:6].reshape(2, 3, dim)).shape == (2, 3, dim, dim)
     assert controller.jacobian(points[:0]).shape == (0, dim, dim)
 
@@ -215,10 +215,11 @@ def test_jacobian_of_what_is_returned(make):
     speeds = np.linalg.norm(controller(points), axis=1)
     assert (speeds < 0.999 * limit).any()
     assert (speeds > 0.999 * limit).any()
-    found, wanted = controller.jacobian(points), differences(controller, points)
+    jacobians, wanted = controller.jacobian(points), differences(controller, points)
     scale = np.abs(wanted).max(axis=(1, 2), keepdims=True)
-    assert np.median(np.abs(found - wanted) / scale) < 1e-7
-    assert (np.abs(found - wanted) <= 1e-3 * scale).mean() > 0.95  # but where a law has a kink between two differences
+    assert np.median(np.abs(jacobians - wanted) / scale) < 1e-7
+    # but where a law has a kink between two differences
+    assert (np.abs(jacobians - wanted) <= 1e-3 * scale).mean() > 0.95
 
 
 def test_the_jacobian_feeds_acceleration_forward():

@@ -98,14 +98,14 @@ def test_exported_programs_have_the_gradients_of_the_system(make_field, position
             y = points.clone().requires_grad_(asked)
             inputs = [y] if asked else []
             wanted = torch.autograd.grad(ds(y).square().sum(), [*inputs, *ds.parameters()])
-            found = torch.autograd.grad(system(y).square().sum(), [*inputs, *system.parameters()])
-            for one, other in zip(found, wanted, strict=True):
+            gradients = torch.autograd.grad(system(y).square().sum(), [*inputs, *system.parameters()])
+            for one, other in zip(gradients, wanted, strict=True):
                 torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-11)
     ds.requires_grad_(False)
     y = points.clone().requires_grad_()
-    (found,) = torch.autograd.grad(torch.compile(ds, backend="aot_eager")(y).sum(), [y])
+    (gradient,) = torch.autograd.grad(torch.compile(ds, backend="aot_eager")(y).sum(), [y])
     (wanted,) = torch.autograd.grad(ds(y).sum(), [y])
-    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-11)
+    torch.testing.assert_close(gradient, wanted, rtol=1e-9, atol=1e-11)
 
 
 TRANSFORMS = {
@@ -124,8 +124,8 @@ def test_compiled_transforms(transform, make_field, positions):
     for call in (ds, ds.encode, ds.decode):
         transformed = TRANSFORMS[transform](lambda y, call=call: call(y))
         torch._dynamo.reset()
-        found = torch.compile(transformed, backend="aot_eager")(points)
-        torch.testing.assert_close(found, transformed(points), rtol=1e-9, atol=1e-11)
+        compiled = torch.compile(transformed, backend="aot_eager")(points)
+        torch.testing.assert_close(compiled, transformed(points), rtol=1e-9, atol=1e-11)
 
 
 def test_exporting_a_rollout_is_refused(make_field, positions):

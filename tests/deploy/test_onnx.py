@@ -38,9 +38,9 @@ def run(tmp_path):
 def test_equal_for_every_law(dim, dtype, dynamics, make_field, positions, run, assert_same_velocity):
     ds = make_field(dim, dynamics)
     points = positions(ds).to(dtype)
-    found = run(ds, points, dtype)
-    assert found.dtype == points.numpy().dtype
-    assert_same_velocity(found, ds, points.double(), LIMITS[dtype])
+    velocities = run(ds, points, dtype)
+    assert velocities.dtype == points.numpy().dtype
+    assert_same_velocity(velocities, ds, points.double(), LIMITS[dtype])
 
 
 def test_real_size(make_field, positions, run, assert_same_velocity, tmp_path):
@@ -59,10 +59,10 @@ def test_real_size(make_field, positions, run, assert_same_velocity, tmp_path):
 def test_any_batch(count, make_field, positions, run, assert_same_velocity):
     ds = make_field(2)
     points = positions(ds)[:count]
-    found = run(ds, points)
-    assert found.shape == (count, 2)
+    velocities = run(ds, points)
+    assert velocities.shape == (count, 2)
     if count:
-        assert_same_velocity(found, ds, torch.cat([points, positions(ds)])[:count], 1e-12)
+        assert_same_velocity(velocities, ds, torch.cat([points, positions(ds)])[:count], 1e-12)
 
 
 def test_positions_that_are_not_finite(dynamics, make_field, run, assert_spoils_its_row_alone):
@@ -72,9 +72,9 @@ def test_positions_that_are_not_finite(dynamics, make_field, run, assert_spoils_
 def test_at_rest_and_very_far(dynamics, make_field, run):
     ds = make_field(2, dynamics)
     points = torch.stack([ds.attractor, ds.attractor + 1e-160, torch.full((2,), 1e200, dtype=torch.float64)])
-    found = run(ds, points)
-    assert np.abs(found[:2]).max() < 1e-9
-    assert np.isfinite(found).all()
+    velocities = run(ds, points)
+    assert np.abs(velocities[:2]).max() < 1e-9
+    assert np.isfinite(velocities).all()
 
 
 @pytest.mark.parametrize("dtype", LIMITS)
@@ -90,11 +90,11 @@ def test_the_file_tells_where_it_comes_from(tmp_path):
     export.write(ds, tmp_path / "field.onnx")
     model = onnx.load(tmp_path / "field.onnx")
     onnx.checker.check_model(model, full_check=True)
-    told = {entry.key: entry.value for entry in model.metadata_props}
-    assert told["method"] == "ChebyshevDS"
-    assert told["dim"] == "2"
-    assert [float(value) for value in told["goal"].split(", ")] == shown.goal.tolist()
-    assert shown.fingerprint[1] in told["learned from"]
+    metadata = {entry.key: entry.value for entry in model.metadata_props}
+    assert metadata["method"] == "ChebyshevDS"
+    assert metadata["dim"] == "2"
+    assert [float(value) for value in metadata["goal"].split(", ")] == shown.goal.tolist()
+    assert shown.fingerprint[1] in metadata["learned from"]
 
 
 class Doubled(ChebyshevDS):

@@ -233,11 +233,11 @@ def test_adjoint_kernels_serve_float32_cores_and_batches_of_none(monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     monkeypatch.setattr(dispatch, "_available_cores", lambda: 2)
     shared = [first_gradients(CALLS["inverse"], psi, x, x) for _ in range(5)]
-    for found in shared:
-        assert all(torch.equal(one, other) for one, other in zip(found, alone, strict=True))
+    for gradients in shared:
+        assert all(torch.equal(one, other) for one, other in zip(gradients, alone, strict=True))
     nobody, nothing = torch.zeros(0, 3).requires_grad_(), torch.zeros(0, 3)
-    for found in first_gradients(CALLS["inverse"], psi, nobody, nothing):
-        assert not found.any()
+    for gradients in first_gradients(CALLS["inverse"], psi, nobody, nothing):
+        assert not gradients.any()
 
 
 def test_what_is_not_a_number_spoils_the_gradients_on_both_paths():
@@ -296,10 +296,10 @@ def test_gradients_reach_parameters_that_were_swapped_in():
     psi, other, points = random_map(2, 6), random_map(2, 6, seed=3), random_points(5, 2)
     swapped = {name: torch.nn.Parameter(value.detach()) for name, value in other.named_parameters()}
     value = torch.func.functional_call(psi, swapped, (points,))
-    found = torch.autograd.grad(value.sum(), list(swapped.values()))
+    gradients = torch.autograd.grad(value.sum(), list(swapped.values()))
     with dispatch.reference():
         expected = torch.autograd.grad(other(points).sum(), list(other.parameters()))
-    for one, wanted in zip(found, expected, strict=True):
+    for one, wanted in zip(gradients, expected, strict=True):
         torch.testing.assert_close(one, wanted)
 
 
@@ -473,8 +473,8 @@ def test_an_edit_of_what_a_kernel_inlines_compiles_it_anew(tmp_path):
     )
 
     def run():
-        found = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
-        value, hits = found.stdout.split()
+        process = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+        value, hits = process.stdout.split()
         return float(value), int(hits)
 
     assert run() == (pytest.approx(math.exp(-2)), 0)

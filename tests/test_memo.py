@@ -8,7 +8,8 @@ import pickle
 import torch
 from torch import nn
 
-from latentds.memory import Memo, tensors_of
+from latentds.kernels.private import tensors_of
+from latentds.memo import Memo
 
 
 class Counted:

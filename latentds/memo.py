@@ -1,4 +1,4 @@
-"""What was computed from tensors, kept for as long as their values stay as they were."""
+"""The result of a computation on tensors, kept until one of their values changes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Generic, TypeVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 T = TypeVar("T")
 
@@ -32,9 +32,3 @@ class Memo(Generic[T]):
 
     def __reduce__(self) -> tuple[type[Memo[T]], tuple[()]]:
         return type(self), ()
-
-
-def tensors_of(module: nn.Module) -> list[Tensor]:
-    """Parameters and buffers of a module and of those in it; faster than asking for each."""
-    held = (part for one in module.modules() for part in (one._parameters, one._buffers))
-    return [tensor for part in held for tensor in part.values() if tensor is not None]
