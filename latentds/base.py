@@ -25,13 +25,14 @@ from .deploy.controller import Controller
 from .deploy.tables import FieldTables, field_tables
 from .diffeomorphism import Diffeomorphism, eager_for_derivatives
 from .dynamics import Frame, LatentDynamics
-from .fidelity import POINTS, ROUNDING, Excerpt, Fidelity, FitWarning, measure, restart_gap
+from .fidelity import POINTS, ROUNDING, Excerpt, Fidelity, FitWarning, measure
 from .files import write_tensors
 from .integrate import integrate
 from .kernels.dispatch import no_active_transforms
 from .kernels.private import tensors_of
 from .memo import Memo
-from .wrappers import Similarity, check_rotation
+from .probes import restart_gap, round_trip_gap
+from .similarity import Similarity, check_rotation
 
 FORMAT = 4
 """Of the files of systems; raised when they change so that another latentds would misread them."""
@@ -491,9 +492,9 @@ class LatentDS(StableDS):
         """
         points = shown.positions.to(self.attractor)
         gap = float(torch.linalg.vector_norm(shown.goal - shown.start))
-        off = float((self.decode(self.encode(points)) - points).abs().max()) / gap
+        off = float(round_trip_gap(self, points).max()) / gap
         times = torch.linspace(0, shown.duration, POINTS, dtype=torch.float64)
-        apart = restart_gap(self, self.rollout(points[0], times), times) / shown.size
+        apart = float(restart_gap(self, self.rollout(points[0], times), times)) / shown.size
         rounding = torch.finfo(points.dtype).eps ** 0.4
         if not off < rounding:
             raise ValueError(

@@ -23,6 +23,7 @@ from .arguments import number_in, whole_number
 from .base import StableDS
 from .demonstration import Demonstration
 from .fidelity import FitWarning
+from .probes import unit_ball
 
 Factory = Callable[[int], StableDS]
 Measure = Callable[[Any, "Cell"], Mapping[str, Any]]
@@ -66,9 +67,7 @@ class RolloutProtocol:
 
     def starts(self, demonstration: Demonstration) -> Tensor:
         """(1 + n_starts, n): the demonstrated start, then the others; the same offsets for every method and motion."""
-        # The first n coordinates of a uniform point on the sphere of R^(n+2) are uniform in the ball of R^n.
-        normal = np.random.default_rng(0).standard_normal((self.n_starts, demonstration.dim + 2))
-        ball = (normal / np.linalg.norm(normal, axis=1, keepdims=True))[:, : demonstration.dim]
+        ball = unit_ball(self.n_starts, demonstration.dim, np.random.default_rng(0))
         offsets = np.concatenate([np.zeros((1, demonstration.dim)), self.radius * ball])
         return demonstration.start + torch.from_numpy(offsets)
 

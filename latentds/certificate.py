@@ -13,11 +13,12 @@ from torch import Tensor
 
 from .arguments import real_array, whole_number
 from .base import LatentDS, MovedDS, StableDS
-from .fidelity import ROUNDING, STARTS, Excerpt, measure
+from .fidelity import FLOW_GAP, ROUNDING, STARTS, Excerpt, measure
+from .probes import flow_gap, jacobian_gap, restart_gap, round_trip_gap
 
 Verdict = Literal["proven", "not falsified", "falsified"]
 
-HORIZON = 100.0
+ARRIVES_WITHIN = 100.0
 """Durations within which every motion must arrive: far beyond what any pause or far start of a sound fit costs."""
 N_TIMES = 101
 """Times of one duration at which motions are looked at."""
@@ -213,7 +214,7 @@ class _Search:
         points = torch.cat([self.points, passed])
         with torch.no_grad():
             x = ds.encode(points)
-            there = torch.linalg.vector_norm(ds.decode(x) - points, dim=-1) / self.size
+            there = round_trip_gap(ds, points) / self.size
             # In units of the longest way to the goal: of a demonstration, if there is one.
             way = torch.linalg.vector_norm(ds.encode(self.starts) - ds.frame().attractor, dim=-1, keepdim=True)
             back = ds.latent_error(self.starts, self.times) * way / way[: len(self.shown) or None].max()
@@ -228,12 +229,7 @@ class _Search:
         points = self.points[:: max(1, len(self.points) // 64)]
         with torch.no_grad():
             x = ds.encode(points)
-            closed = ds.jacobian(x)
-        x = x.requires_grad_()
-        decoded = ds.decode(x)
-        rows = [torch.autograd.grad(column.sum(), x, retain_graph=True)[0] for column in decoded.unbind(-1)]
-        wanted = torch.stack(rows, dim=-2)
-        error = torch.linalg.matrix_norm(closed - wanted) / torch.linalg.matrix_norm(wanted)
+        error = jacobian_gap(ds, x)
         return self._judge("the closed-form Jacobian is autograd's", error, self.tolerance, "relative error", points)
 
     def _conditioning(self, ds: LatentDS, x: Tensor, points: Tensor) -> Line:
@@ -296,13 +292,13 @@ class _Search:
         with torch.no_grad():
             energy = self.ds.lyapunov(self.paths)
             rise = energy.diff(dim=-1) / energy[:, :1]
-            middle = N_TIMES // 2
-            anew = self.ds.rollout(self.paths[:, middle], self.times[middle:])
-            apart = torch.linalg.vector_norm(anew - self.paths[:, middle:], dim=-1).amax(-1) / self.size
+            apart = restart_gap(self.ds, self.paths, self.times) / self.size
+            off = flow_gap(self.ds, self.starts, self.times) / self.size
         before = self.paths[:, :-1].flatten(0, 1)
         return [
             self._judge("V falls along motions", rise.flatten(), self.tolerance, "largest rise over V(0)", before),
             self._judge("a motion is its two halves", apart, self.rounding, "largest distance", self.starts),
+            self._judge("motions are the field's integral", off, FLOW_GAP, "largest distance", self.starts),
         ]
 
     def _descent(self) -> Line:
@@ -338,10 +334,10 @@ class _Search:
         return relative, (uphill * ahead).sum(-1)
 
     def _convergence(self) -> Line:
-        times = torch.tensor([0.0, HORIZON * self.duration], dtype=torch.float64).to(self.times.device)
+        times = torch.tensor([0.0, ARRIVES_WITHIN * self.duration], dtype=torch.float64).to(self.times.device)
         with torch.no_grad():
             left = torch.linalg.vector_norm(self.ds.rollout(self.starts, times)[:, -1] - self.goal, dim=-1) / self.size
-        claim = f"every motion arrives within {HORIZON:g} durations"
+        claim = f"every motion arrives within {ARRIVES_WITHIN:g} durations"
         return self._judge(claim, left, 1e-3, "largest distance left", self.starts)
 
     def _follows(self) -> Line:

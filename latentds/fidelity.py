@@ -15,6 +15,7 @@ from .arguments import Array, number_in, point_array, positive
 from .curves import extent, jitter
 from .demonstration import Demonstration
 from .metrics import dtw, endpoint_error, path_length, path_length_ratio
+from .probes import flow_gap, largest_rise, restart_gap, unit_ball
 
 MISS = 0.05
 """Largest mean distance from the demonstration, in its sizes; good fits stay below half of it, even of 1 % noise."""
@@ -31,6 +32,9 @@ that brings back what is so far off in a twentieth of the duration is a few time
 ROUNDING = 1e-3
 """What rounding may do along a motion: let V rise by so much of itself, carry it so many sizes away when it is begun
 anew half-way, bring encode(decode(x)) so many latent lengths off x. Sound systems stay orders of magnitude below."""
+FLOW_GAP = 0.02
+"""Distance of a rollout from the integral of the velocity field, in sizes; sound fits stay below
+a third of it."""
 
 STARTS = 8
 """Motions from nearby starts."""
@@ -118,6 +122,8 @@ class Fidelity:
         fastest: largest velocity on the demonstrated path and within ``BESIDE`` sizes of it, over the largest shown.
         rise: largest rise of V along the motion, over V at its start.
         restart_gap: largest distance of the motion from the same one begun anew half-way, in sizes.
+        flow_gap: largest distance, in sizes, of that motion and of two from beside its start from the integral of the
+            velocity field, which is what a robot runs.
         latent_error: see :meth:`~latentds.LatentDS.latent_error`; 0 for a system without latent space.
         spread: of several demonstrations, how far they miss each other: as ``miss``, each and the next. Nobody can
             follow all of them more closely, so it is added to what ``miss``, ``end`` and ``nearby`` may be.
@@ -131,6 +137,7 @@ class Fidelity:
     fastest: float
     rise: float
     restart_gap: float
+    flow_gap: float = 0.0
     latent_error: float = 0.0
     spread: float = 0.0
     shown: tuple[Excerpt, ...] = field(default=(), repr=False)
@@ -171,6 +178,10 @@ class Fidelity:
                 f"its motion begun anew half-way is another one, {self.restart_gap:.3g} sizes away",
             ),
             (
+                self.flow_gap / FLOW_GAP,
+                f"its rollout is {self.flow_gap:.3g} sizes off the integral of its velocity field, which a robot runs",
+            ),
+            (
                 self.latent_error / ROUNDING,
                 f"rounding breaks its map, encode(decode(x)) is {self.latent_error:.3g} latent lengths from x",
             ),
@@ -193,8 +204,7 @@ def measure(ds: System, shown: Sequence[Excerpt]) -> Fidelity:
     dim = len(shown[0].path[0])
     around = draw.standard_normal((STARTS, dim))
     around /= np.linalg.norm(around, axis=1, keepdims=True)
-    ball = draw.standard_normal((PLACES, dim + 2))  # the first n coordinates on the sphere of R^(n+2): even in a ball
-    ball = (ball / np.linalg.norm(ball, axis=1, keepdims=True))[:, :dim]
+    ball = unit_ball(PLACES, dim, draw)
     paths = [np.array(one.path) for one in shown]
     duration = max(one.duration for one in shown)
     every = [
@@ -230,14 +240,8 @@ def _measure(ds: System, one: Excerpt, path: Array, duration: float, around: Arr
         "end": endpoint_error(motions[0], path) / size,
         "nearby": float(np.max(missed[1:], initial=0.0)),
         "fastest": float(torch.linalg.vector_norm(velocity, dim=-1).max()) / one.fastest,
-        "rise": float(energy.diff().max() / energy[0]),
-        "restart_gap": restart_gap(ds, moved[0], times) / size,
+        "rise": float(largest_rise(energy)),
+        "restart_gap": float(restart_gap(ds, moved[0], times)) / size,
+        "flow_gap": float(flow_gap(ds, starts[:3], times).max()) / size,
         "latent_error": 0.0 if error is None else float(error.max()),
     }
-
-
-def restart_gap(ds: System, motion: Tensor, times: Tensor) -> float:
-    """Largest distance of a motion (T, n) at ``times`` (T,) from the same one begun anew half-way: 0 for a flow."""
-    middle = len(times) // 2
-    anew = ds.rollout(motion[middle], times[middle:])
-    return float(torch.linalg.vector_norm(anew - motion[middle:], dim=-1).max())

@@ -235,7 +235,7 @@ BROKEN = {
     DividesByZero: "velocities are finite",
     RunsBackwards: "latent motions approach",
 }
-ALONE = {RestsElsewhereTangentially, HasAWrongJacobian, EncodesWrongly, Circles, Jumps, Ages, Rises, Stalls}
+ALONE = {RestsElsewhereTangentially, HasAWrongJacobian, EncodesWrongly, Jumps, Rises, Stalls}
 
 
 def test_the_stubs_would_be_sound():

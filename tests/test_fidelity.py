@@ -253,7 +253,7 @@ def test_each_figure_tells_its_fault(stub):
     assert len(caught) == 1
     fidelity = ds.fit_report.fidelity
     assert [note for note in fidelity.notes if PLANTED[stub] in note], fidelity.notes
-    assert stub is Diverges or len(fidelity.notes) == 1, fidelity.notes
+    assert stub in (Diverges, Scatters) or len(fidelity.notes) == 1, fidelity.notes
     assert not fidelity.follows
     assert certify(ds, [[-2, -2, -2], [2, 2, 2]], n_samples=10).lines[-1].verdict == "falsified"
 
@@ -417,6 +417,28 @@ def test_a_warning_that_is_an_error_leaves_the_fit_before():
     assert torch.equal(ds.attractor, goal)
 
 
+class Modulated(ChebyshevDS):
+    """Rolls out as its parent does, but the field goes aside half-way."""
+
+    def forward(self, y):
+        aside = torch.exp(-((y - self.start).norm(dim=-1, keepdim=True) ** 2))
+        return super().forward(y) + 0.5 * aside * torch.tensor([0.0, 1.0, 0.0], dtype=y.dtype)
+
+
+@pytest.mark.parametrize("hooked", [False, True])
+def test_what_a_robot_runs_is_what_is_judged(hooked):
+    """Rollouts that are perfect say nothing of a field that is another one."""
+    shown = datasets.unstable_spiral(1, 300)
+    ds = (ChebyshevDS if hooked else Modulated)(3, n_layers=60)
+    if hooked:
+        ds.register_forward_hook(lambda module, inputs, velocity: 0.8 * velocity)
+    with pytest.warns(FitWarning, match="sizes off the integral of its velocity field, which a robot runs"):
+        fidelity = ds.fit(shown).fit_report.fidelity
+    assert fidelity.miss < MISS
+    assert not fidelity.follows
+    assert "motions are the field's integral" in {line.claim for line in certify(ds, n_samples=40).falsified}
+
+
 @pytest.mark.parametrize(
     "learned", [Learned(np.float32(0.5), np.int64(3), [np.float32(1)]), Learned(torch.tensor(0.5), 3, (1,))]
 )
@@ -517,7 +539,7 @@ def test_an_excerpt_that_is_none_is_refused(change, message):
 
 def test_figures_that_are_no_numbers_do_not_pass():
     good = Follower(3).fit(decay()).fit_report.fidelity
-    for name in ("miss", "length_ratio", "end", "nearby", "fastest", "rise", "restart_gap", "latent_error"):
+    for name in ("miss", "length_ratio", "end", "nearby", "fastest", "rise", "restart_gap", "flow_gap", "latent_error"):
         assert not replace(good, **{name: float("nan")}).follows
     assert isinstance(good, Fidelity)
     assert "path" not in repr(good)

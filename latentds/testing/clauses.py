@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 
 from ..base import LatentDS
 from ..demonstration import Demonstration
+from ..probes import jacobian_gap, round_trip_gap
 from .case import Case, Clause, expect, same, told, watched, wavy_motion
 
 
@@ -148,7 +149,8 @@ def check_inverse(case: Case) -> None:
     if isinstance(ds := case.ds, LatentDS):
         with torch.no_grad():
             x = ds.encode(case.probes)
-            same(ds.decode(x), case.probes, "decode(encode(y))", relative=1e-7)
+            off = float(round_trip_gap(ds, case.probes).max())
+            expect(off <= 1e-7 * float(case.probes.abs().max()), f"decode(encode(y)): off by {off:.3g}")
             between = (x[:-1] + x[1:]) / 2
             same(ds.encode(ds.decode(between)), between, "encode(decode(x))", relative=1e-7)
 
@@ -158,9 +160,8 @@ def check_jacobian(case: Case) -> None:
     if isinstance(ds := case.ds, LatentDS):
         with torch.no_grad():
             x = ds.encode(case.probes)[::4]
-            closed = ds.jacobian(x)
-        for row, found in zip(x, closed, strict=True):
-            same(found, torch.func.jacrev(ds.decode)(row), "jacobian(x)", relative=1e-8)
+        off = float(jacobian_gap(ds, x).max())
+        expect(off <= 1e-8, f"jacobian(x) is {off:.3g} of itself off")
 
 
 def check_gradients(case: Case) -> None:

@@ -1,0 +1,87 @@
+"""What is tried on a system by more than one judge: by fidelity after each fit, by the certificate, by the contract.
+
+Each returns a figure; what it may be is for the judge to say.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import torch
+from scipy.integrate import cumulative_simpson
+from torch import Tensor
+
+from .arguments import Array
+
+
+class Moving(Protocol):
+    """A velocity field with its motions: any :class:`~latentds.StableDS`."""
+
+    attractor: Tensor
+
+    def __call__(self, y: Tensor) -> Tensor: ...
+
+    def rollout(self, y0: Tensor, t: Tensor) -> Tensor: ...
+
+
+class Latent(Protocol):
+    """A system with a latent space: any :class:`~latentds.LatentDS`."""
+
+    def encode(self, y: Tensor) -> Tensor: ...
+
+    def decode(self, x: Tensor) -> Tensor: ...
+
+    def jacobian(self, x: Tensor) -> Tensor: ...
+
+
+def unit_ball(count: int, dim: int, draw: np.random.Generator) -> Array:
+    """Points evenly distributed in the unit ball of R^n: (count, n)."""
+    # The first n coordinates of a uniform point on the sphere of R^(n+2) are uniform in the ball of R^n.
+    normal = draw.standard_normal((count, dim + 2))
+    return np.asarray((normal / np.linalg.norm(normal, axis=1, keepdims=True))[:, :dim])
+
+
+def largest_rise(energy: Tensor) -> Tensor:
+    """Of V along motions, over V at their start: (..., T) -> (...)."""
+    return energy.diff(dim=-1).amax(-1) / energy[..., 0]
+
+
+def restart_gap(ds: Moving, motions: Tensor, times: Tensor) -> Tensor:
+    """Largest distance of motions from the same ones begun anew half-way, 0 for a flow: (..., T, n), (T,) -> (...)."""
+    middle = len(times) // 2
+    anew = ds.rollout(motions[..., middle, :], times[middle:])
+    gaps: Tensor = torch.linalg.vector_norm(anew - motions[..., middle:, :], dim=-1).amax(-1)
+    return gaps
+
+
+def flow_gap(ds: Moving, y0: Tensor, times: Tensor) -> Tensor:
+    """How far motions are from the integral of the velocity field along them: (..., n), (T,) evenly spaced -> (...).
+
+    0 for the field's own flow but for Simpson's rule at four points a step. Nothing is solved, so that stiff fields
+    cost no more.
+    """
+    finer = torch.linspace(0, float(times[-1] - times[0]), 4 * len(times) - 3, dtype=times.dtype, device=times.device)
+    motions = ds.rollout(y0, finer)
+    passed = cumulative_simpson(ds(motions).double().cpu().numpy(), x=finer.cpu().numpy(), axis=-2, initial=0)
+    missed = motions - motions[..., :1, :] - torch.from_numpy(passed).to(motions)
+    gaps: Tensor = torch.linalg.vector_norm(missed, dim=-1).amax(-1)
+    return gaps
+
+
+def round_trip_gap(ds: Latent, y: Tensor) -> Tensor:
+    """‖decode(encode(y)) - y‖: (..., n) -> (...)."""
+    gaps: Tensor = torch.linalg.vector_norm(ds.decode(ds.encode(y)) - y, dim=-1)
+    return gaps
+
+
+def jacobian_gap(ds: Latent, x: Tensor) -> Tensor:
+    """‖J - J'‖/‖J'‖, J the closed-form Jacobian and J' autograd's, in the Frobenius norm: (B, n) -> (B,)."""
+    x = x.detach().requires_grad_()
+    with torch.enable_grad():
+        rows = [torch.autograd.grad(column.sum(), x, retain_graph=True)[0] for column in ds.decode(x).unbind(-1)]
+    wanted = torch.stack(rows, dim=-2)
+    with torch.no_grad():
+        closed = ds.jacobian(x)
+    gaps: Tensor = torch.linalg.matrix_norm(closed - wanted) / torch.linalg.matrix_norm(wanted)
+    return gaps
