@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from latentds.arguments import whole_number
+from latentds.resizing import assign, make_room
 
 from .couplings import no_autocast
-from .mixture import GaussianMixture, drawn_seed, make_room, resize, scikit_learn
+from .mixture import GaussianMixture, drawn_seed, scikit_learn
 from .networks import NormalizedDS, thinned
 from .pooling import Pool
 from .training import Training
@@ -124,7 +125,7 @@ class LinearSystems(nn.Module):
         values, vectors = np.linalg.eigh(-(pulled + pulled.swapaxes(1, 2)) / 2)
         values = np.sqrt(values.clip(min=0))
         root = np.linalg.cholesky(metric - 1e-3 * np.eye(len(metric)))
-        resize(self, {"root": root, "turning": pulled / 2, "damping": vectors * values[:, None, :]})
+        assign(self, {"root": root, "turning": pulled / 2, "damping": vectors * values[:, None, :]})
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         make_room(self, state_dict, prefix, ["turning", "damping"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import random
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from latentds.arguments import check_points, whole_number
+from latentds.resizing import assign, make_room
 
 from .pooling import Pool
 
@@ -63,7 +63,7 @@ class GaussianMixture(nn.Module):
         roots = np.linalg.cholesky(np.asarray(covariances, dtype=np.float64))
         whiteners = np.linalg.inv(roots)
         heights = np.log(weights) - np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(1)
-        resize(self, {"log_heights": heights, "means": means, "whiteners": whiteners})
+        assign(self, {"log_heights": heights, "means": means, "whiteners": whiteners})
 
     def log_densities(self, x: Tensor) -> Tensor:
         """log h_k - ½ ‖W_k (x - μ_k)‖², each component's: (..., n) -> (..., K)."""
@@ -77,7 +77,7 @@ class GaussianMixture(nn.Module):
         return torch.softmax(self.log_densities(x), dim=-1)
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        make_room(self, state_dict, prefix)
+        make_room(self, state_dict, prefix, ["log_heights", "means", "whiteners"])
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
@@ -110,7 +110,7 @@ class MixtureRegression(nn.Module):
         self.mixture.assign(weights, means[:, :n], covariances[:, :n, :n])
         slopes = np.linalg.solve(covariances[:, :n, :n], covariances[:, :n, n:]).swapaxes(1, 2)
         offsets = means[:, n:] - np.einsum("kij,kj->ki", slopes, means[:, :n])
-        resize(self, {"slopes": slopes, "offsets": offsets})
+        assign(self, {"slopes": slopes, "offsets": offsets})
 
     def forward(self, x: Tensor, seen_at: Tensor | None = None) -> Tensor:
         """(..., n) -> (..., n); the responsibilities are those ``seen_at`` other places (..., n) if these are given."""
@@ -120,7 +120,7 @@ class MixtureRegression(nn.Module):
         return mixed
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        make_room(self, state_dict, prefix)
+        make_room(self, state_dict, prefix, ["slopes", "offsets"])
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
@@ -191,25 +191,3 @@ def scikit_learn(module: str) -> Any:
 def drawn_seed(seed: int | None) -> int:
     """``seed``, or one from torch's generator."""
     return int(torch.randint(2**31 - 1, ())) if seed is None else seed
-
-
-@torch.no_grad()
-def resize(module: nn.Module, values: dict[str, Any]) -> None:
-    """Give parameters of ``module`` new values, of whatever shape; they stay on its device and in its dtype."""
-    for name, value in values.items():
-        old = module.get_parameter(name)
-        new = torch.as_tensor(value).to(old)
-        if old.shape == new.shape:
-            old.copy_(new)
-        else:
-            setattr(module, name, nn.Parameter(new.clone(), requires_grad=old.requires_grad))
-
-
-def make_room(module: nn.Module, state: dict[str, Tensor], prefix: str, names: Sequence[str] | None = None) -> None:
-    """Let parameters, all or those named, have the first size that those of a state to be loaded have."""
-    for name, held in list(module.named_parameters(recurse=False)):
-        if names is not None and name not in names:
-            continue
-        found = state.get(prefix + name)
-        if found is not None and found.ndim == held.ndim and found.shape[1:] == held.shape[1:] and len(found):
-            resize(module, {name: held.new_zeros(found.shape)})

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 from latentds.arguments import whole_number
 from latentds.base import Learned
 from latentds.demonstration import Demonstration
+from latentds.resizing import assign, make_room
 
-from .mixture import make_room, resize
 from .phase import PhaseDriven, refuse_closed
 
 DOUBT = 0.01
@@ -58,7 +58,7 @@ class ProMP(PhaseDriven):
         refuse_closed(shown)
         weights = torch.stack([self._weights(d) for d in shown])
         mean = weights.mean(0)
-        resize(self, {"mean": mean, "deviations": (weights - mean) / len(shown) ** 0.5})
+        assign(self, {"mean": mean, "deviations": (weights - mean) / len(shown) ** 0.5})
         with torch.no_grad():
             self.doubt.fill_(DOUBT * max(d.size for d in shown))
             self._place(shown)
@@ -96,7 +96,7 @@ class ProMP(PhaseDriven):
         return (shown + doubt).reshape(len(one) * self.dim, len(other) * self.dim)
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: object) -> None:
-        make_room(self, state_dict, prefix, names=("deviations",))
+        make_room(self, state_dict, prefix, ["deviations"])
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
 

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor, nn
 
 from latentds.arguments import whole_number
+from latentds.resizing import assign, make_room
 
-from .mixture import GaussianMixture, drawn_seed, fit_regression, make_room, nearby, resize
+from .mixture import GaussianMixture, drawn_seed, fit_regression, nearby
 from .networks import NormalizedDS
 from .pooling import Pool
 from .training import Training, descend_smoothly
@@ -107,7 +108,7 @@ class StableSystems(nn.Module):
         """Every linear system alike, with this mixture."""
         self.mixture.load_state_dict(mixture.state_dict())
         eye = torch.eye(mixture.dim, dtype=torch.float64).expand(mixture.n_components, -1, -1)
-        resize(self, {"spins": torch.zeros_like(eye), "pulls": PACE**0.5 * eye})
+        assign(self, {"spins": torch.zeros_like(eye), "pulls": PACE**0.5 * eye})
 
     def slopes(self) -> Tensor:
         """A_k + ε I, (K, n, n)."""
@@ -119,5 +120,5 @@ class StableSystems(nn.Module):
         return mixed
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: object) -> None:
-        make_room(self, state_dict, prefix)
+        make_room(self, state_dict, prefix, ["spins", "pulls"])
         super()._load_from_state_dict(state_dict, prefix, *rest)  # type: ignore[arg-type]

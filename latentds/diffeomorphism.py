@@ -15,6 +15,7 @@ from .arguments import Array, check_points, check_precision, whole_number
 from .kernels import private, translations
 from .kernels.dispatch import is_plain, no_active_transforms
 from .kernels.functions import Operation, TorchLayers, evaluate
+from .resizing import make_room, resize
 from .tabulated import Tabulated
 
 Self = TypeVar("Self", bound="Diffeomorphism")
@@ -189,7 +190,8 @@ class LocallyWeightedTranslations(Diffeomorphism):
         """
         used = len(centers)
         if self.any_number:
-            self._make_room(used)
+            for parameter in (self.centers, self.log_widths, self.strengths):
+                resize(parameter, max(1, used))
         squared = (widths.unsqueeze(-1) * directions / WIDTH_BOUND).square().sum(-1)
         if used > self.n_layers or not bool((squared < 1).all()) or not bool((widths > 0).all()):
             raise ValueError(
@@ -201,15 +203,9 @@ class LocallyWeightedTranslations(Diffeomorphism):
         self.log_widths.zero_()[:used] = widths.log().to(self.log_widths)
         self.log_widths[used:] = self.log_widths[:used].mean() if used else 0.0
 
-    def _make_room(self, count: int) -> None:
-        """Parameters of so many layers, at least one; the same objects, so that an optimiser keeps hold of them."""
-        for parameter in (self.centers, self.log_widths, self.strengths):
-            parameter.data = parameter.data.new_zeros((max(1, count), *parameter.shape[1:]))
-
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        centers = state_dict.get(prefix + "centers")
-        if self.any_number and centers is not None and centers.ndim == 2:
-            self._make_room(len(centers))
+        if self.any_number:
+            make_room(self, state_dict, prefix, translations.PARAMETERS)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     @eager_for_derivatives

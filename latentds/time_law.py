@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from .arguments import positive
+from .resizing import make_room
 from .tabulated import LawKind, LawTable, Tabulated
 
 LINEAR_BELOW = 1e-3
@@ -201,7 +202,7 @@ class PiecewiseLinearLaw(TimeLaw):
             except ValueError as error:
                 rest[-1].append(str(error))  # load_state_dict's list of what went wrong
                 return
-            self.knots, self.speeds = self.knots.new_empty(knots.shape), self.speeds.new_empty(speeds.shape)
+            make_room(self, state_dict, prefix, ["knots", "speeds"])
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def _arrivals(self) -> Tensor:

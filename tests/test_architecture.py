@@ -10,10 +10,10 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 ROOMS = (
-    "arguments", "curves", "tabulated", "memo", "files", "readers", "recordings", "demonstration", "datasets",
-    "time_law", "kernels", "diffeomorphism", "transform", "dynamics", "deploy", "integrate", "metrics", "probes",
-    "fidelity", "fitting", "similarity", "base", "methods", "storage", "cache", "certificate", "testing", "cell",
-    "benchmark", "plotting", "report", "cli", "__main__",
+    "arguments", "curves", "resizing", "tabulated", "memo", "files", "readers", "recordings", "demonstration",
+    "datasets", "time_law", "kernels", "diffeomorphism", "transform", "dynamics", "deploy", "integrate", "metrics",
+    "probes", "fidelity", "fitting", "similarity", "base", "methods", "storage", "cache", "certificate", "testing",
+    "cell", "benchmark", "plotting", "report", "cli", "__main__",
 )  # fmt: skip
 """Of latentds; each may import itself and those before it."""
 PACKAGES = ("latentds", "baselines", "experiments")
