@@ -12,17 +12,17 @@ from .networks import NormalizedDS
 from .pooling import Pool
 from .training import Training, descend_smoothly
 
-RATE = 1.0
+DESCENT_RATE = 1.0
 """α: V falls at least by α V a duration, so that whatever the regression says a motion is within a hundredth of its way
 after ten."""
-REACH = 0.02
+FADING_RADIUS = 0.02
 """Sizes around the goal within which the regression, which is not 0 there, is led to 0."""
-HASTE = 2.0
+SPEED_CAP = 2.0
 """Times the largest demonstrated speed that f approaches where its linear maps, far from where they were learned, would
 be faster; what was shown it changes by less than a thousandth."""
-FLATTEST = 1e-2
+MIN_EIGENVALUE = 1e-2
 """Least eigenvalue of the quadratic part of V, whose others are about 1."""
-REWARD = 1e-4
+DESCENT_WEIGHT = 1e-4
 """Weight of descending steeply beside that of not rising, as in the authors' code."""
 
 
@@ -33,8 +33,8 @@ class CLFDM(NormalizedDS):
     alone; f is Gaussian mixture regression of the velocities; and u = -∇V max(0, ∇V·f + ρ)/‖∇V‖², the least that gives
     V̇ <= -ρ. Where the demonstrations descend V, f is left as it is. Four things are our own: all matrices are positive
     by parametrisation, so that L-BFGS learns V without constraints; the margin is ρ = α V, which grows without bound
-    and makes V fall exponentially; and f fades to 0 at the goal within ``REACH`` sizes of it, without which the field
-    would jump there, and grows no faster than ``HASTE`` demonstrated speeds.
+    and makes V fall exponentially; and f fades to 0 at the goal within ``FADING_RADIUS`` sizes of it, without which
+    the field would jump there, and grows no faster than ``SPEED_CAP`` demonstrated speeds.
 
     Learns from one demonstration or from several, pooled; their goals' mean is the attractor. ``fit_report.mse`` is the
     mean over all N n entries of the squared velocity error, (units / second)²; ``n_layers`` is the mixture's K; the
@@ -77,7 +77,7 @@ class CLFDM(NormalizedDS):
         regression = fit_regression(pool, self.n_components, drawn_seed(self.seed))
         learner.regression.load_state_dict(regression.state_dict())
         speeds, distances = (torch.linalg.vector_norm(part, dim=-1) for part in (pool.velocities, pool.points))
-        moving = (speeds > 1e-3 * speeds.max()) & (distances > REACH)
+        moving = (speeds > 1e-3 * speeds.max()) & (distances > FADING_RADIUS)
         points, headings = pool.points[moving], pool.velocities[moving] / speeds[moving, None]
         energy.begin(points)
 
@@ -88,7 +88,7 @@ class CLFDM(NormalizedDS):
 
         def loss() -> Tensor:
             rise = rises()
-            return torch.where(rise > 0, rise.square(), -REWARD * rise.square()).mean()
+            return torch.where(rise > 0, rise.square(), -DESCENT_WEIGHT * rise.square()).mean()
 
         history = descend_smoothly(loss, dict.fromkeys(energy.parameters(), 1.0), self.iterations)
         with torch.no_grad():
@@ -103,12 +103,12 @@ class CLFDM(NormalizedDS):
         return energy.to(wanted)
 
     def normalized_velocity(self, u: Tensor) -> Tensor:
-        fading = -torch.expm1(-u.square().sum(-1, keepdim=True) / (2 * REACH**2))
+        fading = -torch.expm1(-u.square().sum(-1, keepdim=True) / (2 * FADING_RADIUS**2))
         wish = fading * self.regression(u, nearby(u))
         speed = torch.linalg.vector_norm(wish, dim=-1, keepdim=True)
-        wish = wish / (1 + (speed / (HASTE * self.pace)) ** 8) ** 0.125
+        wish = wish / (1 + (speed / (SPEED_CAP * self.pace)) ** 8) ** 0.125
         slope = self.energy.gradient(u)
-        excess = (slope * wish).sum(-1) + RATE * self.energy(u)
+        excess = (slope * wish).sum(-1) + DESCENT_RATE * self.energy(u)
         steep = slope.square().sum(-1).clamp(min=torch.finfo(u.dtype).tiny)
         velocity: Tensor = wish - (excess.clamp(min=0) / steep).unsqueeze(-1) * slope
         return velocity
@@ -120,7 +120,7 @@ class AsymmetricQuadratics(nn.Module):
     z·∇V > 0 everywhere but at 0, whatever the parameters are: V has no other stationary point, and grows without bound.
 
     Attributes:
-        root: (n, n), of P₀ - ``FLATTEST`` I.
+        root: (n, n), of P₀ - ``MIN_EIGENVALUE`` I.
         roots: (L, n, n), R_l.
         centers: (L, n), μ_l.
     """
@@ -152,7 +152,7 @@ class AsymmetricQuadratics(nn.Module):
 
     def _terms(self, z: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
         """P₀ z, and zᵀ P_l (z - μ_l), (..., L), with its gradient P_l (2 z - μ_l), (..., L, n)."""
-        pulled = _times(self.root @ self.root.mT, z) + FLATTEST * z
+        pulled = _times(self.root @ self.root.mT, z) + MIN_EIGENVALUE * z
         here, forms = z.unsqueeze(-2), self.roots @ self.roots.mT
         values = (here * _times(forms, here - self.centers)).sum(-1)
         return pulled, (values, _times(forms, 2 * here - self.centers))

@@ -23,11 +23,11 @@ STIFFNESS = 25.0
 """α_z; β_z = α_z / 4 makes the spring critically damped, and its double rate is α_z / 2."""
 FADING = -math.log(0.01)
 """α_x: the phase variable x = exp(-α_x s) has come down to a hundredth when the demonstration ends."""
-HORIZON = 3.0
+SPRING_HORIZON = 3.0
 """Durations after which the force, by then a millionth of what it was, is over."""
 GRID = 1e-3
 """Durations between two entries of the tables of responses."""
-RIDGE = 1e-6
+RIDGE_WEIGHT = 1e-6
 """Of the least squares, for responses of unit length."""
 
 
@@ -76,7 +76,7 @@ class DMP(PhaseDriven):
             unbent = [fresh.motion(d.start, 0.0, s) for d, s in zip(shown, phases, strict=True)]
             wanted = torch.cat([d.positions for d in shown]) - torch.cat(unbent)
             lengths = torch.linalg.vector_norm(bent, dim=0)
-            bent = torch.cat([bent / lengths, math.sqrt(RIDGE) * torch.eye(self.n_basis, dtype=torch.float64)])
+            bent = torch.cat([bent / lengths, math.sqrt(RIDGE_WEIGHT) * torch.eye(self.n_basis, dtype=torch.float64)])
             wanted = torch.cat([wanted, wanted.new_zeros(self.n_basis, self.dim)])
             fresh.weights.copy_(torch.linalg.lstsq(bent, wanted, driver="gelsd").solution / lengths[:, None])
             self.load_state_dict(fresh.state_dict())
@@ -105,7 +105,7 @@ class DMP(PhaseDriven):
 
     def _response(self, s: Tensor) -> tuple[Tensor, Tensor]:
         """Position and velocity that a weight of 1 has made by phases (T,), for each ψ_i: (T, B) each."""
-        inside = s.clamp(0, HORIZON) / GRID
+        inside = s.clamp(0, SPRING_HORIZON) / GRID
         cell = inside.long().clamp(max=self.responses.shape[1] - 2)
         u = (inside - cell).unsqueeze(-1)
         (p, q), (v, w) = ((part[cell], part[cell + 1]) for part in self.responses)
@@ -113,7 +113,7 @@ class DMP(PhaseDriven):
         bend, twist = 3 * rise - 2 * v - w, v + w - 2 * rise
         moved = p + u * (v + u * (bend + u * twist))
         moving = (v + u * (2 * bend + u * 3 * twist)) / GRID
-        rate, late = STIFFNESS / 2, (s - HORIZON).clamp(min=0)
+        rate, late = STIFFNESS / 2, (s - SPRING_HORIZON).clamp(min=0)
         stand, swing = (part.unsqueeze(-1) for part in _spring(late))
         fall = torch.exp(-rate * late).unsqueeze(-1)
         return stand * moved + swing * moving, -(rate**2) * swing * moved + (fall - rate * swing) * moving
@@ -137,11 +137,11 @@ def basis(n_basis: int, x: Array) -> Array:
 
 @lru_cache(maxsize=8)
 def responses(n_basis: int) -> Array:
-    """The spring's position and velocity under each x ψ_i alone, every ``GRID`` durations: (2, HORIZON / GRID + 1, B).
+    """The spring's position and velocity under each x ψ_i alone, every ``GRID`` durations: (2, T, B).
 
     By Runge and Kutta's method of order 4.
     """
-    count = round(HORIZON / GRID)
+    count = round(SPRING_HORIZON / GRID)
     x = np.exp(-FADING * np.arange(2 * count + 1) * GRID / 2)
     forces = x[:, None] * basis(n_basis, x)
     pull = np.array([[0.0, 1.0], [-(STIFFNESS**2) / 4, -STIFFNESS]])

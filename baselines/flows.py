@@ -18,11 +18,11 @@ from .couplings import AffineCouplings
 from .networks import seeded_generator
 from .training import Plan, Training, descend
 
-STAGES = 8
+BENDING_STAGES = 8
 """Steps from the chord to the demonstration in the tuned recipe."""
-BEND = 0.05
+STRAIGHTNESS_SCALE = 0.05
 """Scale of the tuned recipe's straightness, in sizes of the demonstration."""
-REST = 1e-2
+REST_SPEED = 1e-2
 """Share of the mean speed below which the tuned recipe no longer asks for relative accuracy."""
 
 
@@ -156,7 +156,7 @@ def descend_bending(
 
     In the plane a curve may cross itself while it bends, so there the demonstration is learned at once.
     """
-    stages = STAGES if learner.dim > 2 else 1
+    stages = BENDING_STAGES if learner.dim > 2 else 1
     short = plan.epochs // 19
     history: list[float] = []
     notes: list[str] = []
@@ -198,7 +198,7 @@ def ray_loss(
     owner = data.owner.to(points.device)
     linearize = quickest_linearize(psi)
     squared_speeds = velocities.square().sum(-1)
-    squared_speeds = squared_speeds + REST**2 * squared_speeds.mean()
+    squared_speeds = squared_speeds + REST_SPEED**2 * squared_speeds.mean()
     anchors = torch.cat([starts, goal.unsqueeze(0)])
 
     def loss(batch: Tensor) -> Tensor:
@@ -211,7 +211,7 @@ def ray_loss(
         rest = torch.zeros_like(anchors)
         flow, away = push(torch.stack([torch.cat([latent, rest]), torch.cat([aside, rest])]))[:, :n]
         error = (factor * flow - v).square().sum(-1) / squared_speeds[batch]
-        bend = (away / BEND).square().sum(-1)
+        bend = (away / STRAIGHTNESS_SCALE).square().sum(-1)
         turn = (unit_vector(z[:n]) - ray).square().sum(-1)
         return torch.mean(2 * ((1 + error).sqrt() - 1) + (1 + bend).sqrt() - 1 + turn)
 

@@ -22,17 +22,17 @@ from .training import Training
 
 Array = NDArray[np.float64]
 
-RATE = 0.1
+LEAST_RATE = 0.1
 """Least rate at which √V falls, per duration of the demonstration."""
-ROUND = 0.02
+LEAST_EIGENVALUE = 0.02
 """Least eigenvalue of P whose mean eigenvalue is 1: bounds how flat its ellipsoids are."""
-DIRECTION = 0.5
+DIRECTION_WEIGHT = 0.5
 """What a unit of direction counts beside a size of the motion where samples are clustered."""
-LOCAL = 0.3
+LOCAL_WEIGHT = 0.3
 """Weight of each system's own misses beside the mixture's: systems that cancel on the samples run wild off them."""
-BREADTH = 1e-3
+LEAST_VARIANCE = 1e-3
 """Least variance of a component, in squared sizes: narrower ones switch from one system to the next like a jump."""
-REST = 0.1
+REST_SPEED = 0.1
 """Share of the mean speed below which a direction counts less."""
 LEAST_WEIGHT = 5e-3
 """Components with fewer of the samples are dropped."""
@@ -112,8 +112,10 @@ class LinearSystems(nn.Module):
     def matrices(self) -> Tensor:
         """A_k, (m, n, n)."""
         pulled = self.turning - self.turning.mT - self.damping @ self.damping.mT
-        found: Tensor = torch.linalg.solve(self.metric(), pulled) - RATE * torch.eye(len(self.root)).to(self.root)
-        return found
+        matrices: Tensor = torch.linalg.solve(self.metric(), pulled) - LEAST_RATE * torch.eye(len(self.root)).to(
+            self.root
+        )
+        return matrices
 
     def forward(self, u: Tensor) -> Tensor:
         """(..., n) -> (..., m, n)."""
@@ -121,7 +123,7 @@ class LinearSystems(nn.Module):
 
     def assign(self, metric: Array, matrices: Array) -> None:
         """Become the systems with this P, (n, n), and these A_k, (m, n, n), up to what breaks the inequality."""
-        pulled = metric @ matrices + RATE * metric
+        pulled = metric @ matrices + LEAST_RATE * metric
         values, vectors = np.linalg.eigh(-(pulled + pulled.swapaxes(1, 2)) / 2)
         values = np.sqrt(values.clip(min=0))
         root = np.linalg.cholesky(metric - 1e-3 * np.eye(len(metric)))
@@ -134,12 +136,16 @@ class LinearSystems(nn.Module):
 
 def _clustered(points: Array, velocities: Array, most: int, seed: int) -> tuple[Array, Array, Array]:
     """Weights (m,), means (m, n) and covariances (m, n, n) of positions, from a mixture of them and directions."""
-    samples = np.hstack([points, DIRECTION * _headings(velocities)])
+    samples = np.hstack([points, DIRECTION_WEIGHT * _headings(velocities)])
     n, most = points.shape[1], min(most, len(points))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a limit of iterations: what they reached is a mixture, too
         mixture = scikit_learn("mixture").BayesianGaussianMixture(
-            n_components=most, weight_concentration_prior=1 / most, reg_covar=BREADTH, max_iter=300, random_state=seed
+            n_components=most,
+            weight_concentration_prior=1 / most,
+            reg_covar=LEAST_VARIANCE,
+            max_iter=300,
+            random_state=seed,
         )
         found = mixture.fit(samples)
     kept = found.weights_ >= min(LEAST_WEIGHT, found.weights_.max())
@@ -153,7 +159,7 @@ def _metric(points: Array, velocities: Array) -> Array:
     metric = cp.Variable((n, n), PSD=True)
     rise = (here[:, :, None] * _headings(velocities)[:, None, :]).reshape(len(here), -1) @ cp.vec(metric, order="C")
     cost = cp.sum(cp.pos(rise)) / len(here) + 1e-3 * cp.sum_squares(metric - np.eye(n))
-    program = cp.Problem(cp.Minimize(cost), [cp.trace(metric) == n, metric >> ROUND * np.eye(n)])
+    program = cp.Problem(cp.Minimize(cost), [cp.trace(metric) == n, metric >> LEAST_EIGENVALUE * np.eye(n)])
     program.solve(solver=cp.CLARABEL)
     return np.asarray((metric.value + metric.value.T) / 2)
 
@@ -164,11 +170,11 @@ def _matrices(points: Array, velocities: Array, shares: Array, metric: Array) ->
     matrices = [cp.Variable((n, n)) for _ in range(count)]
     together = (shares[:, :, None] * points[:, None, :]).reshape(len(points), -1)
     misses = [_miss(together, velocities) @ cp.vstack([*(matrix.T for matrix in matrices), -np.eye(n)])]
-    for matrix, share in zip(matrices, np.sqrt(LOCAL * shares.T)[:, :, None], strict=True):
+    for matrix, share in zip(matrices, np.sqrt(LOCAL_WEIGHT * shares.T)[:, :, None], strict=True):
         misses.append(_miss(share * points, share * velocities) @ cp.vstack([matrix.T, -np.eye(n)]))
     bounds = []
     for matrix in matrices:
-        pulled = metric @ matrix + matrix.T @ metric + 2 * RATE * metric
+        pulled = metric @ matrix + matrix.T @ metric + 2 * LEAST_RATE * metric
         bounds.append((pulled + pulled.T) / 2 << 0)
     cost = cp.sum([cp.sum_squares(miss) for miss in misses])
     cp.Problem(cp.Minimize(cost / len(points)), bounds).solve(solver=cp.CLARABEL)
@@ -183,7 +189,7 @@ def _miss(design: Array, velocities: Array) -> Array:
 def _headings(velocities: Array) -> Array:
     """(N, n) of length 1, less where the motion all but rests and its direction is noise."""
     squares = np.square(velocities).sum(1, keepdims=True)
-    headings: Array = velocities / np.sqrt(squares + REST**2 * squares.mean())
+    headings: Array = velocities / np.sqrt(squares + REST_SPEED**2 * squares.mean())
     return headings
 
 

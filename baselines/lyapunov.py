@@ -14,7 +14,7 @@ from latentds.arguments import number_in, whole_number
 from .couplings import no_autocast
 from .networks import VelocityRegression, linear, perceptron, seeded_generator
 
-QUADRATIC = 1e-2
+QUADRATIC_WEIGHT = 1e-2
 """ε, weight of ‖u‖² in V, which makes it positive and unbounded whatever was learned."""
 
 
@@ -77,7 +77,7 @@ class NeuralLyapunov(VelocityRegression):
     def _energy(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """V and ∇V at u: (..., n) -> (...), (..., n)."""
         value, slope = self.bowl(u)
-        return value + QUADRATIC * u.square().sum(-1), slope + 2 * QUADRATIC * u
+        return value + QUADRATIC_WEIGHT * u.square().sum(-1), slope + 2 * QUADRATIC_WEIGHT * u
 
 
 class Bowl(nn.Module):

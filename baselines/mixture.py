@@ -20,12 +20,12 @@ Array = NDArray[np.float64]
 
 MOST_COMPONENTS = 12
 """How many the Bayesian information criterion may choose from."""
-FAR = 2.0
+NEARBY_RADIUS = 2.0
 """Sizes from the goal beyond which nothing was demonstrated."""
 MOST_SAMPLES = 400
 """That a mixture is fitted to, evenly chosen: neighbours in time tell nearly the same, and counted as so many witnesses
 they let the criterion choose as many components as there are to choose from."""
-RIDGE = 1e-3
+VARIANCE_RIDGE = 1e-3
 """Added to the variances of normalised samples: a thirtieth of a size, so that a single demonstration, of no width,
 does not make a field that changes within its own width."""
 
@@ -125,13 +125,13 @@ class MixtureRegression(nn.Module):
 
 
 def nearby(z: Tensor) -> Tensor:
-    """z (..., n), or where the way there from 0 leaves the ball of radius ``FAR``: (..., n).
+    """z (..., n), or where the way there from 0 leaves the ball of radius ``NEARBY_RADIUS``: (..., n).
 
     Far from all Gaussians their responsibilities change from 0 to 1 within less and less of a size. A field mixed by
     those of the nearby place is as good there and can be integrated.
     """
-    distance = torch.linalg.vector_norm(z, dim=-1, keepdim=True).clamp(min=FAR)
-    near: Tensor = z * (FAR / distance)
+    distance = torch.linalg.vector_norm(z, dim=-1, keepdim=True).clamp(min=NEARBY_RADIUS)
+    near: Tensor = z * (NEARBY_RADIUS / distance)
     return near
 
 
@@ -141,7 +141,7 @@ def fit_mixture(
     """Weights (K,), means (K, d) and full covariances (K, d, d) of a mixture of samples (N, d), by scikit-learn's EM.
 
     Args:
-        samples: (N, d), of about unit size: ``RIDGE`` is added to their variances.
+        samples: (N, d), of about unit size: ``VARIANCE_RIDGE`` is added to their variances.
         n_components: K >= 1; None for the number of 1 to ``most`` with the least Bayesian information criterion.
         seed: of the k-means that EM starts from.
         most: >= 1.
@@ -150,7 +150,7 @@ def fit_mixture(
     most = min(most, len(samples) // (2 * samples.shape[1]) or 1)
     counts = range(1, most + 1) if n_components is None else [n_components]
     fits = [
-        sklearn.GaussianMixture(count, reg_covar=RIDGE, random_state=seed, max_iter=200).fit(samples)
+        sklearn.GaussianMixture(count, reg_covar=VARIANCE_RIDGE, random_state=seed, max_iter=200).fit(samples)
         for count in counts
     ]
     best = fits[0] if len(fits) == 1 else min(fits, key=lambda fit: float(fit.bic(samples)))
@@ -164,8 +164,8 @@ def fit_regression(pool: Pool, n_components: int | None, seed: int) -> MixtureRe
     """
     pace = float(pool.velocities.square().mean().sqrt() / pool.points.std())
     samples = torch.cat([pool.points, pool.velocities / pace], dim=1).numpy()
-    some = np.linspace(0, len(samples) - 1, min(len(samples), max(MOST_SAMPLES, 30 * (n_components or 0)))).round()
-    weights, means, covariances = fit_mixture(samples[some.astype(int)], n_components, seed)
+    chosen = np.linspace(0, len(samples) - 1, min(len(samples), max(MOST_SAMPLES, 30 * (n_components or 0)))).round()
+    weights, means, covariances = fit_mixture(samples[chosen.astype(int)], n_components, seed)
     dim = pool.points.shape[1]
     units = np.concatenate([np.ones(dim), np.full(dim, pace)])
     regression = MixtureRegression(dim)

@@ -23,7 +23,7 @@ Normal = TypeVar("Normal", bound="NormalizedDS")
 Regressing = TypeVar("Regressing", bound="VelocityRegression")
 
 
-MOST = 2000
+MOST_SAMPLES = 2000
 """Samples of all demonstrations together above which only every second, third, … is taken: they lie close together."""
 
 
@@ -110,8 +110,8 @@ class VelocityRegression(NormalizedDS):
 
 
 def thinned(pool: Pool) -> Pool:
-    """Every second, third, … sample of a pool of more than ``MOST``."""
-    stride = math.ceil(len(pool.points) / MOST)
+    """Every second, third, … sample of a pool of more than ``MOST_SAMPLES``."""
+    stride = math.ceil(len(pool.points) / MOST_SAMPLES)
     return pool._replace(points=pool.points[::stride], velocities=pool.velocities[::stride])
 
 

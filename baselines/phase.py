@@ -13,7 +13,7 @@ from latentds.arguments import number_in
 from latentds.base import Learned, StableDS
 from latentds.demonstration import Demonstration, goal_apart
 
-NODES = 1000
+PHASE_NODES = 1000
 """Of the path on which a point's phase is looked up."""
 
 Self = TypeVar("Self", bound="PhaseDriven")
@@ -77,7 +77,7 @@ class PhaseDriven(StableDS):
 
     def forward(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
-        s = torch.arange(NODES).to(self.attractor) / NODES
+        s = torch.arange(PHASE_NODES).to(self.attractor) / PHASE_NODES
         path = torch.cat([self.motion(self.start, 0.0, s), self.attractor.unsqueeze(0)])
         velocities = torch.cat([self.velocity(s), torch.zeros_like(self.attractor).unsqueeze(0)])
         with torch.no_grad():  # not by matrix products, whose rounding differs from batch to batch
@@ -85,13 +85,13 @@ class PhaseDriven(StableDS):
             rows = points.reshape(-1, self.dim)
             node = torch.cdist(rows, path, compute_mode=exact).argmin(-1).reshape(points.shape[:-1])
         share, apart = [], []
-        for first in (node.clamp(min=1) - 1, node.clamp(max=NODES - 1)):
+        for first in (node.clamp(min=1) - 1, node.clamp(max=PHASE_NODES - 1)):
             step = path[first + 1] - path[first]
             squared = step.square().sum(-1).clamp(min=torch.finfo(step.dtype).tiny)
             share.append((((points - path[first]) * step).sum(-1) / squared).clamp(0, 1).unsqueeze(-1))
             apart.append((points - path[first] - share[-1] * step).square().sum(-1, keepdim=True))
         later = (apart[1] < apart[0]).squeeze(-1)
-        first = torch.where(later, node.clamp(max=NODES - 1), node.clamp(min=1) - 1)
+        first = torch.where(later, node.clamp(max=PHASE_NODES - 1), node.clamp(min=1) - 1)
         along = torch.where(later.unsqueeze(-1), share[1], share[0])
         velocity = torch.lerp(velocities[first], velocities[first + 1], along) / self.duration
         return velocity.to(wanted)

@@ -14,9 +14,9 @@ from latentds.resizing import assign, make_room
 
 from .phase import PhaseDriven, refuse_closed
 
-DOUBT = 0.01
+OBSERVATION_NOISE = 0.01
 """Standard deviation of a weight that no demonstration tells of, in sizes: all there is with a single one."""
-RIDGE = 1e-8
+RIDGE_WEIGHT = 1e-8
 """Of the least squares that finds a demonstration's weights."""
 
 
@@ -24,9 +24,9 @@ class ProMP(PhaseDriven):
     """Probabilistic movement primitive: y(s) = Σ_i w_i φ_i(s), w ~ N(μ, Σ), s = t / duration up to 1.
 
     Paraschos et al. 2013: φ are normalised Gaussians even in s; each demonstration's w is a least squares, μ their mean
-    and Σ their covariance, to which ``DOUBT``² I is added, without which a single demonstration could begin only where
-    it began. A rollout is the mean motion given that it is at its start now and at the goal at the end, eq. 5 with no
-    noise, twice. A single demonstration says nothing of how offsets die: then they do within a basis function.
+    and Σ their covariance, to which ``OBSERVATION_NOISE``² I is added, without which a single demonstration could begin
+    only where it began. A rollout is the mean motion given that it is at its start now and at the goal at the end,
+    eq. 5 with no noise, twice. One demonstration says nothing of how offsets die: they do within a basis function.
 
     At the end of the phase the motion stays where it is, at the goal. There is no attractor beyond that: it does not
     return to the goal from elsewhere, and cannot :meth:`resume` once its phase has ended.
@@ -41,7 +41,7 @@ class ProMP(PhaseDriven):
     Attributes:
         mean: (B, n), μ.
         deviations: (D, B, n), of each demonstration's weights from μ, over √D: Σ is the sum of their outer products.
-        doubt: () buffer, ``DOUBT`` in the units of the positions.
+        doubt: () buffer, ``OBSERVATION_NOISE`` in the units of the positions.
     """
 
     doubt: Tensor
@@ -52,7 +52,7 @@ class ProMP(PhaseDriven):
         straight = torch.linspace(1, 0, self.n_basis, dtype=torch.float64)
         self.mean = nn.Parameter(straight.unsqueeze(-1) * self.start)
         self.deviations = nn.Parameter(torch.zeros(1, self.n_basis, self.dim, dtype=torch.float64))
-        self.register_buffer("doubt", torch.tensor(DOUBT, dtype=torch.float64))
+        self.register_buffer("doubt", torch.tensor(OBSERVATION_NOISE, dtype=torch.float64))
 
     def _learn(self, shown: Sequence[Demonstration], progress: bool) -> Learned:
         refuse_closed(shown)
@@ -60,13 +60,13 @@ class ProMP(PhaseDriven):
         mean = weights.mean(0)
         assign(self, {"mean": mean, "deviations": (weights - mean) / len(shown) ** 0.5})
         with torch.no_grad():
-            self.doubt.fill_(DOUBT * max(d.size for d in shown))
+            self.doubt.fill_(OBSERVATION_NOISE * max(d.size for d in shown))
             self._place(shown)
         return self._learned(shown, self.n_basis)
 
     def _weights(self, shown: Demonstration) -> Tensor:
         values, _ = basis(self.n_basis, shown.times / shown.duration)
-        normal = values.mT @ values + RIDGE * len(values) * torch.eye(self.n_basis, dtype=torch.float64)
+        normal = values.mT @ values + RIDGE_WEIGHT * len(values) * torch.eye(self.n_basis, dtype=torch.float64)
         solved: Tensor = torch.linalg.solve(normal, values.mT @ (shown.positions - shown.goal))
         return solved + shown.goal
 

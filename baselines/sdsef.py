@@ -23,11 +23,11 @@ PLANS = {
     "official": Plan(epochs=5000, learning_rate=1e-4, weight_decay=1e-10, clip=0.1, patience=250),
     "tuned": Plan(epochs=710, learning_rate=1e-3, n_batches=4, warm_up=0.05, clip=1.0, slack=0.3),
 }
-GUARD = 1e-3
+LINEAR_WITHIN = 1e-3
 """Share of the demonstration's latent length below which the speed falls linearly: a unit vector is not Lipschitz."""
-FAR = 1.5
-"""Latent lengths from the goal within which the nodes of a rollout are ``GUARD`` lengths apart; further out sparser."""
-TAIL = 40
+EVEN_WITHIN = 1.5
+"""Latent lengths from the goal within which a rollout's nodes are ``LINEAR_WITHIN`` apart; farther out sparser."""
+TAIL_NODES = 40
 """Nodes of a rollout within the guard, each a factor e nearer to the goal: the last is at 1e-20 of the length."""
 
 
@@ -108,7 +108,8 @@ class NormalizedDescent(FlowDynamics):
     """ẋ = -exp(g(y)) z / max(‖z‖, ε), z = x - x*: straight to the goal, at a speed that is a function of y = ψ(x).
 
     g, a network of 2 x 100 leaky ReLUs over normalised y, is held within the range that it had along the
-    demonstration, widened by 1 each way, so that speeds far away stay bounded and above 0. ε is ``GUARD`` lengths.
+    demonstration, widened by 1 each way, so that speeds far away stay bounded and above 0. ε is
+    ``LINEAR_WITHIN`` lengths.
 
     Args:
         diffeomorphism: ψ, for :meth:`flow` and for normalising; a reference, not a submodule.
@@ -137,7 +138,7 @@ class NormalizedDescent(FlowDynamics):
 
     def forward(self, x: Tensor, y: Tensor, frame: Frame) -> Tensor:
         offset = x - frame.attractor
-        distance = torch.linalg.vector_norm(offset, dim=-1).clamp(min=GUARD * frame.length)
+        distance = torch.linalg.vector_norm(offset, dim=-1).clamp(min=LINEAR_WITHIN * frame.length)
         pull: Tensor = self.speed(y) / distance
         return -pull.unsqueeze(-1) * offset
 
@@ -155,12 +156,12 @@ class NormalizedDescent(FlowDynamics):
         rule of fourth order, and w at the given times by cubic Hermite interpolation.
         """
         refuse_tracing("this rollout")
-        guard = GUARD * frame.length
+        guard = LINEAR_WITHIN * frame.length
         offset = x - frame.attractor
         floor = torch.finfo(x.dtype).tiny ** 0.25
         distance = (offset.square().sum(-1) + (floor * frame.length) ** 2).sqrt()
         begin = _stretch(distance, guard)
-        end = begin.detach().clamp(max=0.0) - TAIL
+        end = begin.detach().clamp(max=0.0) - TAIL_NODES
         spread = (begin.detach() - end).nan_to_num(0.0, 4096).flatten()
         # The demonstrated start spreads over a whole number of cells: rounding down or up there would make it jump.
         n_cells = 1 + int(torch.cat([spread, spread.new_tensor([8.0])]).amax().clamp(max=4096).round())
@@ -186,7 +187,7 @@ class NormalizedDescent(FlowDynamics):
         if not (finite and self.duration > 0 and frame.length > 0):
             return -math.inf
         slowest = float(torch.exp(self.log_speed_range.min()) / self.duration)
-        return slowest / max(radius, GUARD * float(frame.length))
+        return slowest / max(radius, LINEAR_WITHIN * float(frame.length))
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         """Refuse numbers that no such dynamics can have: those of a file, say."""
@@ -200,16 +201,16 @@ class NormalizedDescent(FlowDynamics):
 
 
 def _stretch(r: Tensor, guard: Tensor) -> Tensor:
-    """w(r): log(r/ε) below the guard ε, r/ε - 1 up to FAR lengths, then 100 asinh of a hundredth of the rest."""
+    """w(r): log(r/ε) below the guard ε, r/ε - 1 up to EVEN_WITHIN lengths, then like a logarithm."""
     unit = r / guard
-    edge = FAR / GUARD
+    edge = EVEN_WITHIN / LINEAR_WITHIN
     beyond = torch.asinh((unit - edge).clamp(min=0) / 100) * 100
     return torch.log(unit.clamp(max=1.0)) + unit.clamp(1.0, edge) - 1 + beyond
 
 
 def _unstretch(w: Tensor, guard: Tensor) -> tuple[Tensor, Tensor]:
     """r(w) and dr/dw."""
-    edge = FAR / GUARD - 1
+    edge = EVEN_WITHIN / LINEAR_WITHIN - 1
     tail = torch.exp(w.clamp(max=0.0))
     beyond = (w - edge).clamp(min=0) / 100
     return guard * (tail + w.clamp(0.0, edge) + 100 * torch.sinh(beyond)), guard * tail * torch.cosh(beyond)

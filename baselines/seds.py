@@ -13,18 +13,18 @@ from .networks import NormalizedDS
 from .pooling import Pool
 from .training import Training, descend_smoothly
 
-SLOWEST = 0.05
+LEAST_RATE = 0.05
 """Least rate at which every linear system approaches the goal, in 1 / duration: the margin of a strict inequality."""
 
-PACE = 2.0
+USUAL_RATE = 2.0
 """The rate of every linear system in directions that no demonstration tells of: across a single path, all of them."""
-LEAN = 1e-5
-"""Weight of what says so, the squared entries of A_k + ``PACE`` I."""
-STEPS = {"spins": 2.0, "pulls": 2.0, "mixture.log_heights": 1.0, "mixture.means": 0.1, "mixture.whiteners": 5.0}
+RIDGE_WEIGHT = 1e-5
+"""Weight of what says so, the squared entries of A_k + ``USUAL_RATE`` I."""
+STEP_SIZES = {"spins": 2.0, "pulls": 2.0, "mixture.log_heights": 1.0, "mixture.means": 0.1, "mixture.whiteners": 5.0}
 """How far a parameter goes for a change that shows, in sizes and durations."""
-PRIOR = 1e-3
-"""Weight of what holds the mixture near that of the demonstrations, in squared ``STEPS``: of 26 LASA shapes trained on
-four demonstrations it lowers the error at the other three, which a mixture that is free to shrink does not know."""
+MIXTURE_WEIGHT = 1e-3
+"""Weight of what holds the mixture near that of the demonstrations, in squared ``STEP_SIZES``: of 26 LASA shapes
+trained on four demonstrations it lowers the error at the other three, which a mixture free to shrink does not know."""
 
 
 class SEDS(NormalizedDS):
@@ -60,17 +60,19 @@ class SEDS(NormalizedDS):
         learner = SEDS(**self.settings)
         systems = learner.systems
         systems.assign(fit_regression(pool, self.n_components, drawn_seed(self.seed)).mixture)
-        steps = {systems.get_parameter(name): step for name, step in STEPS.items()}
+        steps = {systems.get_parameter(name): step for name, step in STEP_SIZES.items()}
         before = {parameter: parameter.detach().clone() for parameter in systems.mixture.parameters()}
         unit = pool.velocities.square().mean()
 
         def plain_loss() -> Tensor:
             error: Tensor = (systems(pool.points) - pool.velocities).square().mean() / unit
-            lean: Tensor = (systems.slopes() + PACE * torch.eye(self.dim).double()).square().sum()
-            return error + LEAN * lean
+            lean: Tensor = (systems.slopes() + USUAL_RATE * torch.eye(self.dim).double()).square().sum()
+            return error + RIDGE_WEIGHT * lean
 
         def loss() -> Tensor:
-            return plain_loss() + PRIOR * sum(((p - known) / steps[p]).square().sum() for p, known in before.items())
+            return plain_loss() + MIXTURE_WEIGHT * sum(
+                ((p - known) / steps[p]).square().sum() for p, known in before.items()
+            )
 
         history = descend_smoothly(
             plain_loss, {p: step for p, step in steps.items() if p not in before}, self.iterations
@@ -108,7 +110,7 @@ class StableSystems(nn.Module):
         """Every linear system alike, with this mixture."""
         self.mixture.load_state_dict(mixture.state_dict())
         eye = torch.eye(mixture.dim, dtype=torch.float64).expand(mixture.n_components, -1, -1)
-        assign(self, {"spins": torch.zeros_like(eye), "pulls": PACE**0.5 * eye})
+        assign(self, {"spins": torch.zeros_like(eye), "pulls": USUAL_RATE**0.5 * eye})
 
     def slopes(self) -> Tensor:
         """A_k + ε I, (K, n, n)."""
@@ -116,7 +118,7 @@ class StableSystems(nn.Module):
 
     def forward(self, z: Tensor) -> Tensor:
         values = (self.slopes() * z.unsqueeze(-2).unsqueeze(-2)).sum(-1)
-        mixed: Tensor = (self.mixture(nearby(z)).unsqueeze(-1) * values).sum(-2) - SLOWEST * z
+        mixed: Tensor = (self.mixture(nearby(z)).unsqueeze(-1) * values).sum(-2) - LEAST_RATE * z
         return mixed
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: object) -> None:

@@ -91,7 +91,7 @@ def descend(
     parameters = list(parameters)
     device = parameters[0].device
     entered = [p.detach().clone() for p in parameters]
-    kept = [p.detach().clone() for p in parameters]
+    best_parameters = [p.detach().clone() for p in parameters]
     best, best_epoch, slow, recoveries, step = math.inf, 0, 1.0, 0, 0
     history: list[float] = []
     notes: list[str] = []
@@ -122,7 +122,7 @@ def descend(
                 history.append(math.fsum(losses) / len(losses))
                 if history[-1] < best:
                     best, best_epoch = history[-1], epoch
-                    _copy(kept, entered)
+                    _copy(best_parameters, entered)
                 advance(best)
                 if epoch - best_epoch >= plan.patience:
                     notes.append(f"stopped early at epoch {epoch + 1} of {plan.epochs}, best at {best_epoch + 1}")
@@ -134,10 +134,10 @@ def descend(
             if recoveries > MAX_RECOVERIES:
                 notes.append(f"gave up at epoch {epoch + 1} of {plan.epochs}: diverged {recoveries} times")
                 break
-            _copy(parameters, kept)
+            _copy(parameters, best_parameters)
             adam, slow = _adam(parameters, plan), 0.6 * slow
             advance(best)
-    _copy(parameters, kept)
+    _copy(parameters, best_parameters)
     if recoveries:
         notes.append(f"recovered from {min(recoveries, MAX_RECOVERIES)} divergences")
     return Training(tuple(history), tuple(notes))
@@ -174,7 +174,7 @@ def descend_smoothly(
         return float(value.detach()), (torch.cat([slope.flatten() for slope in slopes]) * steps).numpy()
 
     begin = (torch.cat([p.detach().flatten() for p in moved]) / steps).numpy()
-    found = minimize(
+    minimum = minimize(
         evaluate,
         begin,
         jac=True,
@@ -182,7 +182,7 @@ def descend_smoothly(
         callback=lambda intermediate_result: history.append(float(intermediate_result.fun)),
         options={"maxiter": iterations, "maxfun": 2 * iterations, "maxcor": 20, "ftol": 1e-8, "gtol": 1e-8},
     )
-    assign(found.x)
+    assign(minimum.x)
     return tuple(history)
 
 

@@ -29,7 +29,7 @@ from baselines import FDM, SDSEF
 from experiments import report
 from latentds import ChebyshevDS, Demonstration, FitWarning, StableDS, TubeDS, certify
 from latentds.certificate import Line
-from latentds.fidelity import MISS
+from latentds.fidelity import MISS_LIMIT
 
 SLOW = "SDS-EF"
 """Learns by gradient, so it gets a third of the others' cases."""
@@ -255,7 +255,7 @@ def outcome(case: Case) -> str:
     if not finite:
         return f"{BROKEN} NaN or inf in a rollout from the demonstrated start"
     missed = float(torch.cdist(shown.positions, path).amin(1).mean()) / shown.size
-    if not says and missed > 1.2 * MISS:  # no alignment in time, exact DTW's neither, can bring them nearer
+    if not says and missed > 1.2 * MISS_LIMIT:  # no alignment in time, exact DTW's neither, can bring them nearer
         return f"{BROKEN} a silent misfit off by {missed:.2g} of the size"
     broken = [line for line in certificate.falsified if not (says and _excused(line))]
     if broken:

@@ -25,7 +25,7 @@ from .deploy.controller import Controller
 from .deploy.tables import FieldTables, field_tables
 from .diffeomorphism import Diffeomorphism, eager_for_derivatives
 from .dynamics import Frame, LatentDynamics
-from .fidelity import POINTS, ROUNDING, Excerpt, Fidelity, FitWarning, measure
+from .fidelity import EXCERPT_POINTS, ROUNDING_LIMIT, Excerpt, Fidelity, FitWarning, measure
 from .files import write_tensors
 from .integrate import integrate
 from .kernels.dispatch import no_active_transforms
@@ -305,13 +305,13 @@ class StableDS(nn.Module, ABC):
             ValueError: if a setting is no number, string, boolean, None or system, if the report is not of
                 ``report_type``, or if something other than a regular file is at ``path``.
         """
-        told, report = {"format": FORMAT} | _class_and_settings(self), self.fit_report
+        header, report = {"format": FORMAT} | _class_and_settings(self), self.fit_report
         if report is not None and type(report) is not self.report_type:
             raise ValueError(
                 f"ds: expected a fit_report of report_type {self.report_type.__name__}, got {type(report).__name__}"
             )
         try:
-            about = json.dumps(told | {"report": None if report is None else asdict(report)})
+            about = json.dumps(header | {"report": None if report is None else asdict(report)})
         except TypeError as error:
             raise ValueError(f"ds: expected a fit_report of numbers, strings and tuples, got {error}") from None
         write_tensors(path, self.state_dict(), about)
@@ -493,7 +493,7 @@ class LatentDS(StableDS):
         points = shown.positions.to(self.attractor)
         gap = float(torch.linalg.vector_norm(shown.goal - shown.start))
         off = float(round_trip_gap(self, points).max()) / gap
-        times = torch.linspace(0, shown.duration, POINTS, dtype=torch.float64)
+        times = torch.linspace(0, shown.duration, EXCERPT_POINTS, dtype=torch.float64)
         apart = float(restart_gap(self, self.rollout(points[0], times), times)) / shown.size
         rounding = torch.finfo(points.dtype).eps ** 0.4
         if not off < rounding:
@@ -501,7 +501,7 @@ class LatentDS(StableDS):
                 "demonstration: expected a motion whose map inverts in floats, got one that comes back off by "
                 f"{off:.1e} of the way from start to goal, which is {gap / shown.size:.1e} of its size"
             )
-        if not apart <= max(ROUNDING, rounding):
+        if not apart <= max(ROUNDING_LIMIT, rounding):
             raise ValueError(
                 "demonstration: expected a motion whose map inverts in floats, got one that rounding carries "
                 f"{apart:.1e} of its size away; try a smaller mu, fewer layers, or another method"

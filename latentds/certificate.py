@@ -13,7 +13,7 @@ from torch import Tensor
 
 from .arguments import real_array, whole_number
 from .base import LatentDS, MovedDS, StableDS
-from .fidelity import FLOW_GAP, ROUNDING, STARTS, Excerpt, measure
+from .fidelity import FLOW_GAP_LIMIT, NEARBY_STARTS, ROUNDING_LIMIT, Excerpt, measure
 from .probes import flow_gap, jacobian_gap, restart_gap, round_trip_gap
 
 Verdict = Literal["proven", "not falsified", "falsified"]
@@ -128,7 +128,7 @@ class _Search:
         self.goal = ds.attractor.detach()
         self.size = float((box[1] - box[0]).max())
         self.tolerance = torch.finfo(self.goal.dtype).eps ** 0.4  # 5e-7 in float64
-        self.rounding = max(ROUNDING, self.tolerance)
+        self.rounding = max(ROUNDING_LIMIT, self.tolerance)
         inside = box[0] + (box[1] - box[0]) * self._uniform(n_samples - n_samples // 4, ds.dim)
         radii = self.size * 10 ** (-3 * self._uniform(n_samples // 4, 1))
         near = self.goal.cpu() + radii * self._directions(n_samples // 4)
@@ -143,35 +143,35 @@ class _Search:
         self.shown = _shown(ds)
         self.duration = self.shown[0].duration if self.shown else min(self.size / self.speed, 1e30)
         demonstrated = torch.tensor([one.path[0] for one in self.shown], dtype=torch.float64).reshape(-1, ds.dim)
-        some = self.points[:: max(1, len(self.points) // 32)]
-        self.starts = torch.cat([demonstrated.to(self.points), some])
+        chosen = self.points[:: max(1, len(self.points) // 32)]
+        self.starts = torch.cat([demonstrated.to(self.points), chosen])
         self.times = torch.linspace(0, self.duration, N_TIMES, dtype=torch.float64).to(self.points.device)
 
     def lines(self) -> list[Line]:
-        found, inside = [self._finite()], self.ds
+        lines, inside = [self._finite()], self.ds
         while isinstance(inside, MovedDS):
             inside = inside.ds
         if isinstance(inside, LatentDS):
-            found += self._invertibility(inside)
+            lines += self._invertibility(inside)
         if isinstance(self.ds, LatentDS):
-            found += [self._rate(self.ds)]
-        found += [self._attractor()]
-        if found[0].verdict == "falsified":
-            return found
+            lines += [self._rate(self.ds)]
+        lines += [self._attractor()]
+        if lines[0].verdict == "falsified":
+            return lines
         with torch.no_grad():
             self.paths = self.ds.rollout(self.starts, self.times)
         if isinstance(self.ds, LatentDS):
-            found += self._maps(self.ds)
-        found += [self._equilibria(), self._positive(), self._descent(), *self._motions(), self._convergence()]
-        return [*found, self._follows()] if self.shown else found
+            lines += self._maps(self.ds)
+        lines += [self._equilibria(), self._positive(), self._descent(), *self._motions(), self._convergence()]
+        return [*lines, self._follows()] if self.shown else lines
 
     def _finite(self) -> Line:
         broken = ~torch.isfinite(self.velocity).all(-1)
         return self._judge("velocities are finite", broken.to(self.goal), 0.5, "share that is not", self.points)
 
     def _invertibility(self, ds: LatentDS) -> list[Line]:
-        told = ds.diffeomorphism.invertibility()
-        return [] if told is None else [_settled(told.claim, told.n_checked, told.margin, told.detail, told.fold)]
+        proof = ds.diffeomorphism.invertibility()
+        return [] if proof is None else [_settled(proof.claim, proof.n_checked, proof.margin, proof.detail, proof.fold)]
 
     def _rate(self, ds: LatentDS) -> Line:
         """Proven in the ball around x* that holds all of the region, or all samples if ψ knows no such ball.
@@ -298,7 +298,7 @@ class _Search:
         return [
             self._judge("V falls along motions", rise.flatten(), self.tolerance, "largest rise over V(0)", before),
             self._judge("a motion is its two halves", apart, self.rounding, "largest distance", self.starts),
-            self._judge("motions are the field's integral", off, FLOW_GAP, "largest distance", self.starts),
+            self._judge("motions are the field's integral", off, FLOW_GAP_LIMIT, "largest distance", self.starts),
         ]
 
     def _descent(self) -> Line:
@@ -343,10 +343,10 @@ class _Search:
     def _follows(self) -> Line:
         """Measured again, on the numbers as they are now, against what the report keeps of the demonstrations."""
         fidelity = measure(self.ds, self.shown)
-        badness, told = max(fidelity.findings)
+        badness, words = max(fidelity.findings)
         verdict: Verdict = "not falsified" if fidelity.follows else "falsified"
-        tries = len(self.shown) + STARTS
-        return Line("follows its demonstration", verdict, tries, badness, f"{told}; share of the limit")
+        tries = len(self.shown) + NEARBY_STARTS
+        return Line("follows its demonstration", verdict, tries, badness, f"{words}; share of the limit")
 
     def _judge(self, claim: str, badness: Tensor, limit: float, detail: str, points: Tensor) -> Line:
         """Falsified where ``badness`` (B,) is above ``limit``, or NaN, at one of the ``points`` (B, n)."""

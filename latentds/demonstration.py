@@ -224,19 +224,19 @@ class Demonstration:
 
 def demonstrations_of(demonstration: Any, dim: int) -> list[Demonstration]:
     """The argument of ``fit`` as a list of at least one :class:`Demonstration` of dimension ``dim``."""
-    found = [demonstration] if isinstance(demonstration, Demonstration) else demonstration
-    if not isinstance(found, Sequence) or not found or not all(isinstance(d, Demonstration) for d in found):
+    shown = [demonstration] if isinstance(demonstration, Demonstration) else demonstration
+    if not isinstance(shown, Sequence) or not shown or not all(isinstance(d, Demonstration) for d in shown):
         raise ValueError(
             "demonstration: expected a Demonstration or a non-empty list of them, "
-            f"got {type(demonstration).__name__}" + (" (empty)" if found in ([], ()) else "")
+            f"got {type(demonstration).__name__}" + (" (empty)" if shown in ([], ()) else "")
         )
-    for item in found:
+    for item in shown:
         if item.dim != dim:
             raise ValueError(f"demonstration: expected dimension {dim}, got {item.dim} ({item!r})")
-    named = list({item.columns: None for item in found if item.columns})
+    named = list({item.columns: None for item in shown if item.columns})
     if len(named) > 1:
         raise ValueError(f"demonstration: expected the same columns in all, got {named[0]} and {named[1]}")
-    return list(found)
+    return list(shown)
 
 
 def goal_apart(shown: Demonstration, goal: Tensor) -> float:

@@ -17,32 +17,32 @@ from .demonstration import Demonstration
 from .metrics import dtw, endpoint_error, path_length, path_length_ratio
 from .probes import flow_gap, largest_rise, restart_gap, unit_ball
 
-MISS = 0.05
+MISS_LIMIT = 0.05
 """Largest mean distance from the demonstration, in its sizes; good fits stay below half of it, even of 1 % noise."""
-END = 0.05
+END_LIMIT = 0.05
 """Largest distance from the demonstrated end when the demonstration ends, in sizes of the motion."""
-SHORTEST, LONGEST = 0.8, 1.25
+LEAST_LENGTH_RATIO, LARGEST_LENGTH_RATIO = 0.8, 1.25
 """Length of the motion over that of the demonstration: a shortcut is shorter, a detour longer."""
-NEAR, NEARBY_MISS = 0.01, 0.15
-"""A start so near the demonstrated one, in sizes, that nobody places it better, may miss by thrice ``MISS``: a tight
-spiral spreads good fits that far, a motion that jumps to another strand or to the goal misses by twice as much."""
-BESIDE, FASTEST = 0.1, 20.0
+NEARBY_DISTANCE, NEARBY_LIMIT = 0.01, 0.15
+"""A start so near the demonstrated one, in sizes, that nobody places it better, may miss by thrice ``MISS_LIMIT``:
+a tight spiral spreads good fits that far. A motion that jumps to another strand or to the goal misses by twice it."""
+BESIDE_PATH, SPEED_LIMIT = 0.1, 20.0
 """Within so many sizes of the path no velocity exceeds the largest demonstrated one so many times. The pull of a tube
 that brings back what is so far off in a twentieth of the duration is a few times it; near a fold it is hundreds."""
-ROUNDING = 1e-3
+ROUNDING_LIMIT = 1e-3
 """What rounding may do along a motion: let V rise by so much of itself, carry it so many sizes away when it is begun
 anew half-way, bring encode(decode(x)) so many latent lengths off x. Sound systems stay orders of magnitude below."""
-FLOW_GAP = 0.02
+FLOW_GAP_LIMIT = 0.02
 """Distance of a rollout from the integral of the velocity field, in sizes; sound fits stay below
 a third of it."""
 
-STARTS = 8
+NEARBY_STARTS = 8
 """Motions from nearby starts."""
-PLACES = 400
+PLACES_BESIDE = 400
 """Points beside the path at which velocities are looked at."""
-POINTS, MOST_POINTS, PER_SIZE = 200, 1000, 10
+EXCERPT_POINTS, MOST_EXCERPT_POINTS, EXCERPT_POINTS_PER_SIZE = 200, 1000, 10
 """Points of an excerpt: so many for each of its sizes that the path is long, within these bounds."""
-EXCERPTS = 8
+MOST_EXCERPTS = 8
 """Most demonstrations of one fit that are looked at."""
 
 
@@ -80,15 +80,15 @@ class Excerpt:
         positions = shown.positions.numpy()
         ruler = 4 * jitter(positions)
         length = path_length(positions, ruler)
-        count = int(np.clip(PER_SIZE * length / shown.size, POINTS, MOST_POINTS))
+        count = int(np.clip(EXCERPT_POINTS_PER_SIZE * length / shown.size, EXCERPT_POINTS, MOST_EXCERPT_POINTS))
         path = shown.at(np.linspace(0, shown.duration, count))
         fastest = float(torch.linalg.vector_norm(shown.velocities, dim=-1).max())
         return cls(tuple(map(tuple, path.tolist())), shown.duration, fastest, ruler)
 
     @classmethod
     def of_each(cls, shown: Sequence[Demonstration]) -> tuple[Excerpt, ...]:
-        """Of each demonstration, or of ``EXCERPTS`` of them, evenly chosen."""
-        chosen = np.unique(np.linspace(0, len(shown) - 1, EXCERPTS).round().astype(int))
+        """Of each demonstration, or of ``MOST_EXCERPTS`` of them, evenly chosen."""
+        chosen = np.unique(np.linspace(0, len(shown) - 1, MOST_EXCERPTS).round().astype(int))
         return tuple(cls.of(shown[i]) for i in chosen)
 
 
@@ -117,9 +117,10 @@ class Fidelity:
         miss: distance of the motion from the demonstrated start and the demonstration: exact DTW over points, in sizes.
         length_ratio: length of that motion over that of the demonstration.
         end: distance of its end from the demonstrated one, in sizes.
-        nearby: as ``miss``, the worst of ``STARTS`` motions from ``NEAR`` sizes beside the demonstrated start, or from
-            a quarter of the way to where the demonstration comes back to it.
-        fastest: largest velocity on the demonstrated path and within ``BESIDE`` sizes of it, over the largest shown.
+        nearby: as ``miss``, the worst of ``NEARBY_STARTS`` motions from ``NEARBY_DISTANCE`` sizes beside the
+            demonstrated start, or from a quarter of the way to where the demonstration comes back to it.
+        fastest: largest velocity on the demonstrated path and within ``BESIDE_PATH`` sizes of it, over the largest
+            shown.
         rise: largest rise of V along the motion, over V at its start.
         restart_gap: largest distance of the motion from the same one begun anew half-way, in sizes.
         flow_gap: largest distance, in sizes, of that motion and of two from beside its start from the integral of the
@@ -150,43 +151,46 @@ class Fidelity:
     @property
     def notes(self) -> tuple[str, ...]:
         """What is off, in words, the worst first."""
-        return tuple(told for badness, told in sorted(self.findings, reverse=True) if not badness <= 1)
+        return tuple(words for badness, words in sorted(self.findings, reverse=True) if not badness <= 1)
 
     @property
     def findings(self) -> tuple[tuple[float, str], ...]:
         """Each figure over its limit, and in words."""
         allowed = self.spread
         folded = math.inf if not self.length_ratio > 0 else self.length_ratio
-        found = (
-            (self.miss / (MISS + allowed), f"misses its demonstration by {self.miss:.3g} of the size"),
+        figures = (
+            (self.miss / (MISS_LIMIT + allowed), f"misses its demonstration by {self.miss:.3g} of the size"),
             (
-                max(folded / LONGEST, SHORTEST / folded),
+                max(folded / LARGEST_LENGTH_RATIO, LEAST_LENGTH_RATIO / folded),
                 f"moves {self.length_ratio:.3g} times as far as its demonstration",
             ),
-            (self.end / (END + allowed), f"is {self.end:.3g} of the size from the end when the demonstration ends"),
             (
-                self.nearby / (NEARBY_MISS + allowed),
+                self.end / (END_LIMIT + allowed),
+                f"is {self.end:.3g} of the size from the end when the demonstration ends",
+            ),
+            (
+                self.nearby / (NEARBY_LIMIT + allowed),
                 f"misses by {self.nearby:.3g} of the size from a start beside the demonstrated one",
             ),
             (
-                self.fastest / FASTEST,
-                f"moves {self.fastest:.3g} times as fast as shown within {BESIDE:.0%} of the size from the path",
+                self.fastest / SPEED_LIMIT,
+                f"moves {self.fastest:.3g} times as fast as shown within {BESIDE_PATH:.0%} of the size from the path",
             ),
-            (self.rise / ROUNDING, f"V rises by {self.rise:.3g} of itself along its motion"),
+            (self.rise / ROUNDING_LIMIT, f"V rises by {self.rise:.3g} of itself along its motion"),
             (
-                self.restart_gap / ROUNDING,
+                self.restart_gap / ROUNDING_LIMIT,
                 f"its motion begun anew half-way is another one, {self.restart_gap:.3g} sizes away",
             ),
             (
-                self.flow_gap / FLOW_GAP,
+                self.flow_gap / FLOW_GAP_LIMIT,
                 f"its rollout is {self.flow_gap:.3g} sizes off the integral of its velocity field, which a robot runs",
             ),
             (
-                self.latent_error / ROUNDING,
+                self.latent_error / ROUNDING_LIMIT,
                 f"rounding breaks its map, encode(decode(x)) is {self.latent_error:.3g} latent lengths from x",
             ),
         )
-        return tuple((math.inf if math.isnan(badness) else badness, told) for badness, told in found)
+        return tuple((math.inf if math.isnan(badness) else badness, words) for badness, words in figures)
 
 
 @torch.no_grad()
@@ -202,9 +206,9 @@ def measure(ds: System, shown: Sequence[Excerpt]) -> Fidelity:
     """
     draw = np.random.default_rng(0)
     dim = len(shown[0].path[0])
-    around = draw.standard_normal((STARTS, dim))
+    around = draw.standard_normal((NEARBY_STARTS, dim))
     around /= np.linalg.norm(around, axis=1, keepdims=True)
-    ball = unit_ball(PLACES, dim, draw)
+    ball = unit_ball(PLACES_BESIDE, dim, draw)
     paths = [np.array(one.path) for one in shown]
     duration = max(one.duration for one in shown)
     every = [
@@ -222,8 +226,8 @@ def measure(ds: System, shown: Sequence[Excerpt]) -> Fidelity:
 def _measure(ds: System, one: Excerpt, path: Array, duration: float, around: Array, ball: Array) -> dict[str, float]:
     size, count = extent(path), len(path)
     distance = np.linalg.norm(path - path[0], axis=1)
-    away = np.argmax(distance > 2 * NEAR * size)
-    near = min(NEAR * size, float(distance[away:].min()) / 4)
+    away = np.argmax(distance > 2 * NEARBY_DISTANCE * size)
+    near = min(NEARBY_DISTANCE * size, float(distance[away:].min()) / 4)
     starts = torch.from_numpy(np.concatenate([path[:1], path[0] + near * around])).to(ds.attractor)
     times = torch.linspace(0, duration, count, dtype=torch.float64).to(ds.attractor.device)
     moved = ds.rollout(starts, times)
@@ -232,7 +236,7 @@ def _measure(ds: System, one: Excerpt, path: Array, duration: float, around: Arr
     motions = moved.double().cpu().numpy()
     energy, error = ds.lyapunov(moved[0]), ds.latent_error(starts[0], times)
     missed = [dtw(motion, path) / count / size for motion in motions]
-    beside = path[np.arange(len(ball)) * count // len(ball)] + BESIDE * size * ball
+    beside = path[np.arange(len(ball)) * count // len(ball)] + BESIDE_PATH * size * ball
     velocity = ds(torch.from_numpy(np.concatenate([path, beside])).to(ds.attractor))
     return {
         "miss": missed[0],

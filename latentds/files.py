@@ -115,7 +115,7 @@ def _remove_leftovers(target: Path) -> None:
     """Remove the parts of ``target`` whose writers, processes of this machine, are no more."""
     name = re.compile(re.escape(f".{target.name}.") + r"(\d{1,9})@" + re.escape(platform.node()) + r"\.[0-9a-f]{16}")
     for file in os.listdir(target.parent):
-        if (found := name.fullmatch(file)) and not _is_running(int(found[1])):
+        if (match := name.fullmatch(file)) and not _is_running(int(match[1])):
             target.with_name(file).unlink(missing_ok=True)
 
 

@@ -205,11 +205,11 @@ def _labels(demonstration: Demonstration) -> tuple[str, ...]:
 
 
 def _moved(paths: Mapping[str, Any], demonstration: Demonstration) -> dict[str, Array]:
-    found = {label: real_array(batch, "paths") for label, batch in paths.items()}
-    for label, batch in found.items():
+    batches = {label: real_array(batch, "paths") for label, batch in paths.items()}
+    for label, batch in batches.items():
         if batch.ndim != 3 or batch.shape[-1] != demonstration.dim:
             raise ValueError(f"paths: expected (B, T, {demonstration.dim}) for {label!r}, got {batch.shape}")
-    return found
+    return batches
 
 
 def _box(demonstration: Demonstration, moved: Mapping[str, Array]) -> tuple[Array, Array]:

@@ -48,34 +48,34 @@ def load(path: str | os.PathLike[str], *, classes: Sequence[type[StableDS]] = ()
 
 
 def _rebuilt(text: str, state: dict[str, torch.Tensor], known: dict[str, type[StableDS]]) -> StableDS:
-    told = json.loads(text)
-    if not isinstance(told, dict) or type(told.get("format")) is not int:
+    header = json.loads(text)
+    if not isinstance(header, dict) or type(header.get("format")) is not int:
         raise ValueError("expected a format number in its metadata, got none")
-    if told["format"] != FORMAT:
-        age = "a newer" if told["format"] > FORMAT else "an older"
-        raise ValueError(f"expected format {FORMAT}, got {told['format']}: it needs {age} latentds")
+    if header["format"] != FORMAT:
+        age = "a newer" if header["format"] > FORMAT else "an older"
+        raise ValueError(f"expected format {FORMAT}, got {header['format']}: it needs {age} latentds")
     if not all(bool(torch.isfinite(value).all()) for value in state.values() if value.is_floating_point()):
         raise ValueError("expected finite numbers, got NaN or inf")
     if any(value.is_complex() for value in state.values()):
         raise ValueError("expected real numbers, got complex ones")
     with torch.random.fork_rng(devices=[]):  # an unseeded constructor draws numbers, only to have them replaced
-        ds = _made(told, known, sum(value.numel() for value in state.values()))
+        ds = _made(header, known, sum(value.numel() for value in state.values()))
     dtype = state["attractor"].dtype
     if dtype not in (torch.float64, torch.float32):
         raise ValueError(f"expected an attractor in float64 or float32, got {dtype}")
     ds.to(dtype).load_state_dict(state)
-    ds.fit_report = None if told["report"] is None else _typed(told["report"], ds.report_type, "report")
+    ds.fit_report = None if header["report"] is None else _typed(header["report"], ds.report_type, "report")
     return ds
 
 
-def _made(told: dict[str, Any], known: dict[str, type[StableDS]], held: int) -> StableDS:
+def _made(header: dict[str, Any], known: dict[str, type[StableDS]], held: int) -> StableDS:
     """A system by its class and settings, those of a system in it likewise, that so many stored numbers can fill."""
-    if told["class"] not in known:
+    if header["class"] not in known:
         raise ValueError(
-            f"expected a class among {sorted(known)}, got {told['class']!r:.80}; allow others by classes=[…]"
+            f"expected a class among {sorted(known)}, got {header['class']!r:.80}; allow others by classes=[…]"
         )
-    settings: Any = told["settings"]
-    wanted = inspect.signature(known[told["class"]]).parameters
+    settings: Any = header["settings"]
+    wanted = inspect.signature(known[header["class"]]).parameters
     if not isinstance(settings, dict) or set(settings) != set(wanted):
         raise ValueError(f"expected the settings {sorted(wanted)}, got {settings!r:.200}")
     sizes = [v for k, v in settings.items() if (k == "dim" or k.startswith("n_")) and isinstance(v, int)]
@@ -84,23 +84,23 @@ def _made(told: dict[str, Any], known: dict[str, type[StableDS]], held: int) -> 
     settings = {
         name: _made(value, known, held) if isinstance(value, dict) else value for name, value in settings.items()
     }
-    return known[told["class"]](**settings)
+    return known[header["class"]](**settings)
 
 
-def _typed(told: Any, wanted: Any, name: str) -> Any:
+def _typed(value: Any, wanted: Any, name: str) -> Any:
     """What JSON told, as the type that it had: a dataclass, tuple, number, string or boolean, or None beside one."""
     inner = get_args(wanted)
     if get_origin(wanted) in (Union, UnionType):
-        return None if told is None else _typed(told, next(kind for kind in inner if kind is not NoneType), name)
-    if isinstance(told, dict) and is_dataclass(wanted) and isinstance(wanted, type):
+        return None if value is None else _typed(value, next(kind for kind in inner if kind is not NoneType), name)
+    if isinstance(value, dict) and is_dataclass(wanted) and isinstance(wanted, type):
         types = get_type_hints(wanted)
-        if odd := sorted(set(told) ^ {part.name for part in fields(wanted)}):
+        if odd := sorted(set(value) ^ {part.name for part in fields(wanted)}):
             raise ValueError(f"{name}: expected the fields of {wanted.__name__}, got unknown or missing ones: {odd}")
-        return wanted(**{key: _typed(value, types[key], key) for key, value in told.items()})
-    if isinstance(told, list) and get_origin(wanted) is tuple:
-        each = inner[:1] * len(told) if inner[-1] is ... else inner
-        if len(each) == len(told):
-            return tuple(_typed(value, kind, name) for value, kind in zip(told, each, strict=True))
-    if type(told) is not wanted and (type(told), wanted) != (int, float):
-        raise ValueError(f"{name}: expected {wanted}, got {told!r:.80}")
-    return wanted(told)
+        return wanted(**{key: _typed(part, types[key], key) for key, part in value.items()})
+    if isinstance(value, list) and get_origin(wanted) is tuple:
+        each = inner[:1] * len(value) if inner[-1] is ... else inner
+        if len(each) == len(value):
+            return tuple(_typed(part, kind, name) for part, kind in zip(value, each, strict=True))
+    if type(value) is not wanted and (type(value), wanted) != (int, float):
+        raise ValueError(f"{name}: expected {wanted}, got {value!r:.80}")
+    return wanted(value)

@@ -24,7 +24,7 @@ from latentds import (
     certify,
     datasets,
 )
-from latentds.fidelity import MISS, MOST_POINTS, NEARBY_MISS, POINTS, Excerpt, Fidelity, measure
+from latentds.fidelity import EXCERPT_POINTS, MISS_LIMIT, MOST_EXCERPT_POINTS, NEARBY_LIMIT, Excerpt, Fidelity, measure
 from latentds.testing import wavy_motion
 
 SHARE = np.linspace(0, 1, 1000)
@@ -123,7 +123,7 @@ def test_no_misfit_is_silent(curve, method):
     said = [warning for warning in caught if issubclass(warning.category, FitWarning)]
     assert bool(said) is not report.fidelity.follows
     assert set(report.fidelity.notes) <= set(report.notes)
-    if missed > MISS + 0.005:
+    if missed > MISS_LIMIT + 0.005:
         assert not report.fidelity.follows
         assert f"misses its demonstration by {report.fidelity.miss:.3g} of the size" in str(said[0].message)
     line = certify(ds, n_samples=10).lines[-1]
@@ -134,7 +134,7 @@ def test_no_misfit_is_silent(curve, method):
 def test_what_is_hard_is_missed():
     """Else the test above would test nothing."""
     for motion in (circle(0.02), planar_spiral(2, True), helix(30), lissajous(), trefoil(), noisy(0.05)):
-        assert FDM(motion.dim).fit(motion).fit_report.fidelity.miss > MISS
+        assert FDM(motion.dim).fit(motion).fit_report.fidelity.miss > MISS_LIMIT
 
 
 @pytest.mark.parametrize(
@@ -261,7 +261,7 @@ def test_each_figure_tells_its_fault(stub):
 def test_a_shortcut_within_the_limit_of_the_miss_is_told_by_its_length():
     with pytest.warns(FitWarning) as caught:
         fidelity = Follower(3).fit(decay(wiggle=0.03)).fit_report.fidelity
-    assert fidelity.miss < MISS
+    assert fidelity.miss < MISS_LIMIT
     assert "times as far as its demonstration" in str(caught[0].message)
 
 
@@ -290,7 +290,7 @@ def test_a_start_beside_a_goal_that_lies_near_it_is_not_asked_to_go_the_long_way
 
     fidelity = Tracks(2).fit(circle(0.006)).fit_report.fidelity
     assert fidelity.miss < 1e-2
-    assert fidelity.nearby < NEARBY_MISS
+    assert fidelity.nearby < NEARBY_LIMIT
 
 
 def test_a_method_that_cannot_be_rolled_out_keeps_its_fit_and_says_so():
@@ -434,7 +434,7 @@ def test_what_a_robot_runs_is_what_is_judged(hooked):
         ds.register_forward_hook(lambda module, inputs, velocity: 0.8 * velocity)
     with pytest.warns(FitWarning, match="sizes off the integral of its velocity field, which a robot runs"):
         fidelity = ds.fit(shown).fit_report.fidelity
-    assert fidelity.miss < MISS
+    assert fidelity.miss < MISS_LIMIT
     assert not fidelity.follows
     assert "motions are the field's integral" in {line.claim for line in certify(ds, n_samples=40).falsified}
 
@@ -508,12 +508,16 @@ def test_of_several_demonstrations_the_spread_is_allowed():
     assert tube.fit(near[:1]).fit_report.fidelity.spread == 0
     apart = [Demonstration(base.positions.numpy() + side * np.array([0.0, 0.3]) * bend, base.dt) for side in (1, -1)]
     wide = tube.fit(apart).fit_report.fidelity
-    assert wide.spread > MISS
-    assert wide.miss > MISS
+    assert wide.spread > MISS_LIMIT
+    assert wide.miss > MISS_LIMIT
 
 
 def test_an_excerpt_keeps_what_it_needs():
-    for motion, count in ((datasets.unstable_spiral(1), POINTS), (helix(30), 938), (helix(60), MOST_POINTS)):
+    for motion, count in (
+        (datasets.unstable_spiral(1), EXCERPT_POINTS),
+        (helix(30), 938),
+        (helix(60), MOST_EXCERPT_POINTS),
+    ):
         kept = Excerpt.of(motion)
         assert len(kept.path) == pytest.approx(count, abs=3)
         assert kept.path[0] == tuple(motion.start.tolist())

@@ -130,13 +130,13 @@ def tell_fit(report: FitReport, title: str) -> None:
     if (fit := report.fidelity) is not None:
         more = fit.spread
         for what, value, limit in (
-            ("distance of the motion from the demonstration, in its sizes", fit.miss, fidelity.MISS + more),
-            ("  the worst from starts beside the demonstrated one", fit.nearby, fidelity.NEARBY_MISS + more),
-            ("  of their ends when the demonstration ends", fit.end, fidelity.END + more),
-            ("largest speed within 10 % of the size, over the largest shown", fit.fastest, fidelity.FASTEST),
+            ("distance of the motion from the demonstration, in its sizes", fit.miss, fidelity.MISS_LIMIT + more),
+            ("  the worst from starts beside the demonstrated one", fit.nearby, fidelity.NEARBY_LIMIT + more),
+            ("  of their ends when the demonstration ends", fit.end, fidelity.END_LIMIT + more),
+            ("largest speed within 10 % of the size, over the largest shown", fit.fastest, fidelity.SPEED_LIMIT),
         ):
             table.add_row(what, f"{value:.3g}", f"{limit:.3g}")
-        span = f"{fidelity.SHORTEST:g} to {fidelity.LONGEST:g}"
+        span = f"{fidelity.LEAST_LENGTH_RATIO:g} to {fidelity.LARGEST_LENGTH_RATIO:g}"
         table.add_row("length of the motion over that of the demonstration", f"{fit.length_ratio:.3g}", span)
         if more:
             table.add_row("distance of the demonstrations from each other", f"{more:.3g}", "")

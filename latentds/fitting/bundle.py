@@ -14,20 +14,20 @@ from ..arguments import Array
 from ..curves import directions_along, extent, step_lengths, transported_frames
 from .strands import Strands
 
-WIDE = 0.2
+TUBE_RADIUS = 0.2
 """Radius of the tube in sizes of the motion, where the path leaves room for it, …"""
-ROOM, BEND = 0.4, 0.6
+SHARE_OF_CLEARANCE, SHARE_OF_CURVATURE_RADIUS = 0.4, 0.6
 """… that is, less than such a share of the distance to the next strand, and of the radius of curvature; …"""
-THIN = 0.05
-"""… but no thinner than such a share of ``WIDE``."""
-SMOOTH = 0.05
+LEAST_RADIUS_SHARE = 0.05
+"""… but no thinner than such a share of ``TUBE_RADIUS``."""
+SMOOTHING_WIDTH = 0.05
 """Standard deviation, in sizes of the motion, over which a path is averaged that a whole tube lies around: hooks that
 are smaller than the tube are wide are no turns of the tube."""
-EXTENDED = 0.15, 0.05
+EXTENSIONS = 0.15, 0.05
 """How far the path is carried on straight before its start and beyond its goal, in sizes, where there is room."""
-LIGHT = 0.3
+BESIDE_WEIGHT = 0.3
 """Weight of what lies beside the path: a point there counts as so many of the path."""
-CELLS, FASTEST, TRUST = 60, 10.0, 0.03
+TIMING_CELLS, FASTEST_PACE, USUAL_PACE_WEIGHT = 60, 10.0, 0.03
 """Stretches of the way, each with a pace of its own, that :func:`timing_of` tells apart; most speed in mean speeds; and
 what a pace far from the mean costs beside the times that it explains."""
 
@@ -57,8 +57,8 @@ def bundle(line: Array, path: Array, across: Array) -> Bundle:
     scale = float(np.linalg.norm(axis)) / length
     axis = axis / np.linalg.norm(axis)
     smooth = smoothed(path)
-    reach = radius(path, smooth, WIDE * size)
-    middle = path + (reach / (WIDE * size))[:, None] * (smooth - path)
+    reach = radius(path, smooth, TUBE_RADIUS * size)
+    middle = path + (reach / (TUBE_RADIUS * size))[:, None] * (smooth - path)
     sides = frames_across(smooth)
     x, y = [line], [path]
     weights = [np.ones(count)]
@@ -70,9 +70,9 @@ def bundle(line: Array, path: Array, across: Array) -> Bundle:
             offset[1::2] /= 2
             x.append(line[::every] + scale * offset * across[:, side])
             y.append(middle[::every] + offset * sides[::every, :, side])
-            weights.append(np.full(len(offset), LIGHT * every / (dim - 1)))
+            weights.append(np.full(len(offset), BESIDE_WEIGHT * every / (dim - 1)))
     directions = directions_along(smooth)
-    for end, sign, far, weight in ((0, -1, EXTENDED[0], 1.0), (-1, 1, EXTENDED[1], LIGHT)):
+    for end, sign, far, weight in ((0, -1, EXTENSIONS[0], 1.0), (-1, 1, EXTENSIONS[1], BESIDE_WEIGHT)):
         ahead = np.linspace(0, far * size, 12)[1:, None]
         ahead = ahead[: _free(path[end] + sign * ahead * directions[end], path, ahead[:, 0])]
         for side in (None, *range(dim - 1)):
@@ -93,14 +93,14 @@ def _free(points: Array, path: Array, away: Array) -> int:
 
 
 def smoothed(path: Array) -> Array:
-    """An evenly spaced path averaged over ``SMOOTH`` of its size, the ends kept: (N, n) -> (N, n)."""
+    """An evenly spaced path averaged over ``SMOOTHING_WIDTH`` of its size, the ends kept: (N, n) -> (N, n)."""
     step = float(step_lengths(path).mean())
-    width = SMOOTH * extent(path) / step
+    width = SMOOTHING_WIDTH * extent(path) / step
     count = len(path)
     pad = min(count - 1, int(4 * width) + 1)
     before, after = 2 * path[0] - path[pad:0:-1], 2 * path[-1] - path[-2 : -2 - pad : -1]
-    found: Array = gaussian_filter1d(np.concatenate([before, path, after]), width, axis=0)[pad : pad + count]
-    return found
+    averaged: Array = gaussian_filter1d(np.concatenate([before, path, after]), width, axis=0)[pad : pad + count]
+    return averaged
 
 
 def radius(path: Array, smooth: Array, wanted: float) -> Array:
@@ -109,11 +109,11 @@ def radius(path: Array, smooth: Array, wanted: float) -> Array:
     tangents = np.gradient(smooth, axis=0)
     speeds = np.maximum(np.linalg.norm(tangents, axis=1), 1e-12 * extent(path))
     bends = np.linalg.norm(np.gradient(tangents / speeds[:, None], axis=0), axis=1) / speeds
-    most = np.minimum(ROOM * clearance, BEND / np.maximum(bends, 1e-12 / wanted))
+    most = np.minimum(SHARE_OF_CLEARANCE * clearance, SHARE_OF_CURVATURE_RADIUS / np.maximum(bends, 1e-12 / wanted))
     near = max(1, len(path) // 60)
     most = gaussian_filter1d(minimum_filter1d(most, 2 * near + 1), near, mode="nearest")
-    found: Array = np.minimum(np.clip(most, THIN * wanted, wanted), ROOM * clearance)
-    return found
+    radii: Array = np.minimum(np.clip(most, LEAST_RADIUS_SHARE * wanted, wanted), SHARE_OF_CLEARANCE * clearance)
+    return radii
 
 
 def frames_across(path: Array) -> Array:
@@ -135,22 +135,22 @@ def timing_of(progress: Array, times: Array) -> tuple[Array, Array]:
         Progress, falling from the hindmost start to 0, and seconds, rising from 0, both (m,).
     """
     passed = np.minimum.accumulate(np.maximum(progress, 0), axis=1)
-    edges = np.linspace(0, max(1.0, float(passed[:, 0].max())), CELLS + 1)
+    edges = np.linspace(0, max(1.0, float(passed[:, 0].max())), TIMING_CELLS + 1)
     width, low, high = edges[1], edges[:-1], edges[1:]
-    some = np.linspace(0, passed.shape[1] - 1, CELLS + 1).round().astype(int)[1:]
-    starts, there = passed[:, :1, None], passed[:, some, None]
-    spent = (np.clip(starts, low, high) - np.clip(there, low, high)).reshape(-1, CELLS)
+    chosen = np.linspace(0, passed.shape[1] - 1, TIMING_CELLS + 1).round().astype(int)[1:]
+    starts, there = passed[:, :1, None], passed[:, chosen, None]
+    spent = (np.clip(starts, low, high) - np.clip(there, low, high)).reshape(-1, TIMING_CELLS)
     mean = np.interp(-edges, -passed.mean(0), times.mean(0))
     usual = np.maximum(-np.diff(mean), 1e-3 * mean[0]) / width
-    trust = TRUST * width * math.sqrt(CELLS) * np.eye(CELLS)
+    trust = USUAL_PACE_WEIGHT * width * math.sqrt(TIMING_CELLS) * np.eye(TIMING_CELLS)
     share = 1 / math.sqrt(len(spent))
     duration = float(times[:, -1].mean())
     pace = lsq_linear(
         np.concatenate([share * spent, trust]),
-        np.concatenate([share * times[:, some].reshape(-1), trust @ usual]),
-        bounds=(duration / FASTEST, np.inf),
+        np.concatenate([share * times[:, chosen].reshape(-1), trust @ usual]),
+        bounds=(duration / FASTEST_PACE, np.inf),
         method="bvls",  # exact, so that the unit of time makes no difference
     ).x
     arrivals = np.concatenate([[0.0], np.cumsum(width * pace[::-1])])
-    way = np.linspace(edges[-1], 0, 10 * CELLS + 1)
+    way = np.linspace(edges[-1], 0, 10 * TIMING_CELLS + 1)
     return way, PchipInterpolator(edges[-1] - edges[::-1], arrivals)(edges[-1] - way)

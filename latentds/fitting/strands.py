@@ -33,8 +33,8 @@ class Strands:
             apart = segment_distances(corners[first] - corners[second], step[first], step[second])
             for ends in (first, first + 1, second, second + 1):
                 np.minimum.at(nearest, ends, apart)
-        found: Array = np.interp(np.arange(len(curve)), self.chosen, nearest)
-        return found
+        clearance: Array = np.interp(np.arange(len(curve)), self.chosen, nearest)
+        return clearance
 
     def _apart(self, curve: Array) -> NDArray[np.bool_]:
         """Which pairs of segments are of two strands of this curve, by their middles."""
@@ -42,8 +42,8 @@ class Strands:
         middle, along = (curve[self.chosen][1:] + curve[self.chosen][:-1]) / 2, (arc[1:] + arc[:-1]) / 2
         first, second = self.pairs
         squared = sum((column[second] - column[first]) ** 2 for column in middle.T)
-        found: NDArray[np.bool_] = (along[second] - along[first]) ** 2 > (0.5001 * math.pi) ** 2 * squared
-        return found
+        apart: NDArray[np.bool_] = (along[second] - along[first]) ** 2 > (0.5001 * math.pi) ** 2 * squared
+        return apart
 
 
 def crowded(curve: Array, most: int) -> Array:

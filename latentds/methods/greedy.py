@@ -105,6 +105,6 @@ class GreedyDS(LatentDS):
         """M, β and μ, and a note of those that were not given."""
         if self.n_layers is not None:
             return self.n_layers, self.beta, self.mu, ()
-        found = tuned(latent, points)
-        note = f"chose n_layers {found.n_layers}, beta {found.beta:g} and mu {found.mu:g} by the paper's rule"
-        return found.n_layers, found.beta, found.mu, (note,)
+        choice = tuned(latent, points)
+        note = f"chose n_layers {choice.n_layers}, beta {choice.beta:g} and mu {choice.mu:g} by the paper's rule"
+        return choice.n_layers, choice.beta, choice.mu, (note,)

@@ -65,7 +65,7 @@ class Case:
             expect(goal.shape == (dim,), f"attractor: expected shape ({dim},), got {tuple(goal.shape)}")
         except Exception as error:
             where = f"{dim}-D, {state_of(after_fit)}"
-            raise AssertionError(f"the factory ({where}) breaks “{cls.of.__doc__}” {told(error)}") from error
+            raise AssertionError(f"the factory ({where}) breaks “{cls.of.__doc__}” {cause_of(error)}") from error
         draw = torch.Generator().manual_seed(seed)
 
         def spread(count: int, scale: float) -> Tensor:
@@ -95,7 +95,7 @@ class Case:
         try:
             seeded(lambda: clause(self), self.seed)
         except Exception as error:
-            raise AssertionError(f"{self} breaks {clause.__name__}, “{clause.__doc__}” {told(error)}") from error
+            raise AssertionError(f"{self} breaks {clause.__name__}, “{clause.__doc__}” {cause_of(error)}") from error
 
     def refitted(self, shown: Demonstration, ds: StableDS | None = None) -> StableDS:
         """``ds``, or a new system, fitted from the same random state as the one under examination."""
@@ -156,7 +156,7 @@ def expect(holds: bool, found: str) -> None:
         raise AssertionError(found)
 
 
-def told(error: Exception) -> str:
+def cause_of(error: Exception) -> str:
     return str(error) if isinstance(error, AssertionError) else f"raised {type(error).__name__}: {error}"
 
 

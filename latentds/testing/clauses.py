@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 from ..base import LatentDS
 from ..demonstration import Demonstration
 from ..probes import jacobian_gap, round_trip_gap
-from .case import Case, Clause, expect, same, told, watched, wavy_motion
+from .case import Case, Clause, cause_of, expect, same, watched, wavy_motion
 
 
 def check_attractor(case: Case) -> None:
@@ -49,9 +49,9 @@ def check_times(case: Case) -> None:
     with torch.no_grad():
         paths = ds.rollout(case.starts, times)
         for what, clock in {"": times, " at times that begin at 7 s": times + 7, " at one time": times[:1] + 7}.items():
-            found = ds.rollout(case.starts, clock)
-            same(found, paths[:, : len(clock)], f"rollout{what}")
-            expect(bool((found[:, 0] == case.starts).all()), f"rollout{what} does not begin at y0")
+            path = ds.rollout(case.starts, clock)
+            same(path, paths[:, : len(clock)], f"rollout{what}")
+            expect(bool((path[:, 0] == case.starts).all()), f"rollout{what} does not begin at y0")
         same(paths[:, 1], case.starts, "rollout at t[1] == t[0]")
 
 
@@ -129,9 +129,9 @@ def check_flow(case: Case) -> None:
         begin, end = paths[:, :-1], paths[:, 1:]
 
         def velocity(_: float, flat: np.ndarray) -> np.ndarray:
-            found = ds(torch.from_numpy(flat).reshape(begin.shape))
-            expect(bool(torch.isfinite(found).all()), "the velocity along a rollout is not finite")
-            return np.asarray(found.reshape(-1))
+            slope = ds(torch.from_numpy(flat).reshape(begin.shape))
+            expect(bool(torch.isfinite(slope).all()), "the velocity along a rollout is not finite")
+            return np.asarray(slope.reshape(-1))
 
         # All 64 stretches at once, each from where the rollout has it, take far fewer calls than one integration from
         # start to end. What they miss is added up, as it would be there. No row depends on another: a narrow band.
@@ -224,7 +224,7 @@ def check_dimensions(case: Case) -> None:
         except ValueError:
             continue
         except Exception as error:
-            raise AssertionError(f"{what} in {n}-D: expected a ValueError, {told(error)}") from error
+            raise AssertionError(f"{what} in {n}-D: expected a ValueError, {cause_of(error)}") from error
         raise AssertionError(f"{what} in {n}-D: expected a ValueError, got an answer")
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from baselines import CLFDM
-from baselines.clfdm import RATE, REACH, AsymmetricQuadratics
+from baselines.clfdm import DESCENT_RATE, FADING_RADIUS, AsymmetricQuadratics
 from latentds import Demonstration
 from latentds.testing import parametrize_stable_ds, wavy_motion
 
@@ -56,26 +56,26 @@ def test_v_falls_at_its_rate_from_everywhere(draw):
     ds = CLFDM(2, n_components=3, iterations=30, seed=0).fit(wavy_motion(2))
     y = ds.attractor + 10 ** torch.linspace(-6, 2, 400).unsqueeze(-1) * torch.randn(400, 2, generator=draw).double()
     energy, falling = torch.func.jvp(ds.lyapunov, (y,), (ds(y),))
-    assert float((falling / energy).max()) <= -RATE / float(ds.duration) * (1 - 1e-6)
+    assert float((falling / energy).max()) <= -DESCENT_RATE / float(ds.duration) * (1 - 1e-6)
 
 
 @torch.no_grad()
 def test_the_correction_is_the_least_that_does():
     ds = CLFDM(2, n_components=3, iterations=30, seed=0).fit(wavy_motion(2))
     grid = torch.cartesian_prod(*[torch.linspace(-1, 1, 21, dtype=torch.float64)] * 2)
-    z = grid[grid.norm(dim=-1) > 10 * REACH]
+    z = grid[grid.norm(dim=-1) > 10 * FADING_RADIUS]
     slope, energy = ds.energy.gradient(z), ds.energy(z)
     wish = ds.regression(z)
     speed = wish.norm(dim=-1, keepdim=True)
     wish = wish * (1 + (speed / (2 * ds.pace)) ** 8) ** -0.125
     change = ds._velocity(z) - wish
-    descends = (slope * wish).sum(-1) <= -RATE * energy
+    descends = (slope * wish).sum(-1) <= -DESCENT_RATE * energy
     assert 0.1 < float(descends.double().mean()) < 0.9
     assert float(change[descends].abs().max()) < 1e-12
     along = (change * slope).sum(-1) / slope.norm(dim=-1)
     torch.testing.assert_close(along[~descends].abs(), change[~descends].norm(dim=-1))
     corrected = (slope * ds._velocity(z)).sum(-1)[~descends]
-    torch.testing.assert_close(corrected, -RATE * energy[~descends])
+    torch.testing.assert_close(corrected, -DESCENT_RATE * energy[~descends])
 
 
 def test_it_tells_where_demonstrations_rise():

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import latentds
-from baselines.lpvds import LPVDS, RATE, LinearSystems
+from baselines.lpvds import LEAST_RATE, LPVDS, LinearSystems
 from latentds import Demonstration, datasets
 from latentds.testing import parametrize_stable_ds, wavy_motion
 
@@ -43,7 +43,7 @@ def test_the_inequality_holds_whatever_the_parameters_are(draw):
     systems.assign(np.eye(4), np.stack([-np.eye(4)] * 3))
     for parameter in systems.parameters():
         torch.nn.init.normal_(parameter, generator=draw)
-    pulled = systems.metric() @ systems.matrices() + RATE * systems.metric()
+    pulled = systems.metric() @ systems.matrices() + LEAST_RATE * systems.metric()
     assert float(torch.linalg.eigvalsh(pulled + pulled.mT).detach().max()) < 1e-9
     assert float(torch.linalg.eigvalsh(systems.metric()).detach().min()) > 0
 
@@ -71,7 +71,7 @@ def test_finds_the_linear_system_that_moved():
 def test_v_falls_as_fast_as_promised(fitted, draw):
     y = fitted.attractor + 3 * torch.randn(300, 3, generator=draw, dtype=torch.float64)
     energy, slope = torch.func.jvp(fitted.lyapunov, (y,), (fitted(y).detach(),))
-    assert bool((slope <= -2 * RATE / fitted.duration * energy * (1 - 1e-9)).all())
+    assert bool((slope <= -2 * LEAST_RATE / fitted.duration * energy * (1 - 1e-9)).all())
 
 
 def test_learns_from_several_and_is_kept(tmp_path):

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 from baselines import DMP, ProMP
 from baselines.dmp import FADING, STIFFNESS
-from baselines.promp import DOUBT
+from baselines.promp import OBSERVATION_NOISE
 from latentds import Demonstration, datasets
 from latentds.testing import parametrize_stable_ds, wavy_motion
 
@@ -133,7 +133,7 @@ def test_promp_is_the_conditional_mean():
         return np.kron(heights / heights.sum(), np.eye(2))  # of the weights in the order of ds.mean
 
     each = np.stack([ds._weights(d).numpy().ravel() for d in shown])
-    mean, doubt = each.mean(0), DOUBT * max(d.size for d in shown)
+    mean, doubt = each.mean(0), OBSERVATION_NOISE * max(d.size for d in shown)
     covariance = np.cov(each.T, bias=True) + doubt**2 * np.eye(2 * count)
     seen = np.concatenate([phi(0.0), phi(1.0)])
     gain = covariance @ seen.T @ np.linalg.inv(seen @ covariance @ seen.T)

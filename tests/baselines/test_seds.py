@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from baselines import SEDS
-from baselines.seds import SLOWEST
+from baselines.seds import LEAST_RATE
 from latentds import Demonstration, datasets
 from latentds.testing import parametrize_stable_ds, wavy_motion
 
@@ -41,7 +41,7 @@ def test_every_linear_system_is_stable_whatever_its_parameters(draw):
     assert rates.max() <= 1e-12
     y = ds.attractor + torch.randn(500, 3, generator=draw, dtype=torch.float64)
     falling = (ds(y) * (y - ds.attractor)).sum(-1) / (y - ds.attractor).square().sum(-1)
-    assert float(falling.max()) <= -SLOWEST / float(ds.duration) * (1 - 1e-9)
+    assert float(falling.max()) <= -LEAST_RATE / float(ds.duration) * (1 - 1e-9)
 
 
 def test_velocity_is_the_mixture_of_linear_systems():
@@ -56,7 +56,7 @@ def test_velocity_is_the_mixture_of_linear_systems():
             *(part.detach().numpy() for part in (gate.log_heights, gate.means, gate.whiteners)), strict=True
         )
     ]
-    wanted = sum(h * (a - SLOWEST * np.eye(2)) @ z for h, a in zip(heights, slopes, strict=True)) / sum(heights)
+    wanted = sum(h * (a - LEAST_RATE * np.eye(2)) @ z for h, a in zip(heights, slopes, strict=True)) / sum(heights)
     found = ds(shown.positions[50]).detach().numpy()
     np.testing.assert_allclose(found, wanted * float(ds.size / ds.duration), rtol=1e-9)
 
