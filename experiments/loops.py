@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from latentds import ChebyshevDS
-from latentds.diffeomorphism import WIDTH_BOUND
+from latentds.translations import WIDTH_BOUND
 
 Array = NDArray[np.float64]
 

@@ -5,13 +5,14 @@ from .base import FitReport, LatentDS, Learned, StableDS
 from .benchmark import compare
 from .certificate import Certificate, certify
 from .demonstration import Demonstration
-from .diffeomorphism import Diffeomorphism, LocallyWeightedTranslations
+from .diffeomorphism import Diffeomorphism
 from .fidelity import FitWarning
 from .kernels import warmup
 from .methods.chebyshev import ChebyshevDS
 from .methods.tube import TubeDS
 from .storage import load
 from .transform import as_transform
+from .translations import LocallyWeightedTranslations
 
 __version__ = "0.1.0"  # the one place
 __all__ = [

@@ -11,9 +11,9 @@ import pytest
 ROOT = Path(__file__).parent.parent
 ROOMS = (
     "arguments", "curves", "resizing", "tabulated", "memo", "files", "readers", "recordings", "demonstration",
-    "datasets", "time_law", "kernels", "diffeomorphism", "transform", "dynamics", "deploy", "integrate", "metrics",
-    "probes", "fidelity", "fitting", "similarity", "base", "methods", "storage", "cache", "certificate", "testing",
-    "cell", "benchmark", "plotting", "report", "cli", "__main__",
+    "datasets", "time_law", "kernels", "diffeomorphism", "translations", "transform", "dynamics", "deploy",
+    "integrate", "metrics", "probes", "fidelity", "fitting", "similarity", "base", "methods", "storage", "cache",
+    "certificate", "testing", "cell", "benchmark", "plotting", "report", "cli", "__main__",
 )  # fmt: skip
 """Of latentds; each may import itself and those before it."""
 PACKAGES = ("latentds", "baselines", "experiments")

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..diffeomorphism import ROOT_STEPS
 from ..files import atomic_write
 from ..kernels.adjoint import NEGLIGIBLE
 from ..kernels.translations import BEYOND
 from ..tabulated import LawKind, LawTable
 from ..time_law import LINEAR_BELOW
+from ..translations import ROOT_STEPS
 from .tables import FieldTables, VelocityField, describe, tables_of
 
 

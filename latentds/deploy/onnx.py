@@ -11,11 +11,11 @@ import numpy as np
 import torch
 
 from ..arguments import Array
-from ..diffeomorphism import ROOT_STEPS
 from ..files import atomic_write
 from ..kernels.translations import BEYOND
 from ..tabulated import LawKind, LawTable
 from ..time_law import LINEAR_BELOW
+from ..translations import ROOT_STEPS
 from .tables import FieldTables, VelocityField, describe, tables_of
 
 try:

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from ..arguments import Array
-from ..diffeomorphism import WIDTH_BOUND, Layers, LocallyWeightedTranslations
 from ..kernels.greedy import greedy_kernel
+from ..translations import WIDTH_BOUND, Layers, LocallyWeightedTranslations
 from .strands import Strands
 
 

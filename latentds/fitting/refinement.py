@@ -6,8 +6,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from ..arguments import Array
-from ..diffeomorphism import WIDTH_BOUND, Layers, directions_of, strengths_of
 from ..kernels.translations import forward_and_adjoint
+from ..translations import WIDTH_BOUND, Layers, directions_of, strengths_of
 
 
 def refine(layers: Layers, x: Array, y: Array, mu: float, *, weights: Array | None = None, steps: int = 300) -> Layers:

@@ -18,10 +18,10 @@ from torch import Tensor
 from ..arguments import Array
 from ..curves import extent, frame_along, interpolated, jitter, segment_distances, step_lengths
 from ..demonstration import Demonstration
-from ..diffeomorphism import Layers
 from ..fidelity import Excerpt, System, measure
 from ..metrics import dtw
 from ..time_law import PiecewiseLinearLaw
+from ..translations import Layers
 from .bundle import bundle, frames_across, smoothed, timing_of
 from .embedding import arc_length_path, map_to_endpoints, straight_column
 from .homotopy import clear_direction, curvature_homotopy, drawn_homotopy, linear_homotopy, zoom_homotopy

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from ..arguments import number_in, whole_number
 from ..base import LatentDS, Learned
 from ..demonstration import Demonstration, goal_apart, only_one
-from ..diffeomorphism import LocallyWeightedTranslations
 from ..dynamics import RayDynamics
 from ..fitting.homotopy import linear_homotopy
 from ..fitting.matching import PINS, match_along, pin_ends
 from ..fitting.refinement import refine
 from ..fitting.tuning import tuned
 from ..time_law import TimeLaw
+from ..translations import LocallyWeightedTranslations
 
 BETA, MU = 0.5, 0.9
 """The defaults of β and μ."""

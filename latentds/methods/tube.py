@@ -13,11 +13,11 @@ from ..arguments import Array, number_in
 from ..base import FitReport, LatentDS, Learned
 from ..curves import interpolated, step_lengths
 from ..demonstration import Demonstration, goal_apart
-from ..diffeomorphism import Layers, LocallyWeightedTranslations
 from ..dynamics import TubeDynamics
 from ..fitting.embedding import arc_length_path
 from ..fitting.search import PLAN, Search, Several, refuse_crossings
 from ..time_law import PiecewiseLinearLaw
+from ..translations import Layers, LocallyWeightedTranslations
 
 DECIMALS = 9
 """To which the motion is rounded, in its own sizes."""

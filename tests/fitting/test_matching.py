@@ -11,11 +11,11 @@ from scipy.optimize import minimize_scalar
 
 from baselines import FDM
 from latentds import ChebyshevDS, Demonstration, TubeDS, datasets
-from latentds.diffeomorphism import WIDTH_BOUND
 from latentds.fitting.embedding import chebyshev_columns, map_to_endpoints, straight_column
 from latentds.fitting.homotopy import linear_homotopy
 from latentds.fitting.matching import PINS, match, match_along, pin_ends
 from latentds.testing import wavy_motion
+from latentds.translations import WIDTH_BOUND
 
 # Table I of the paper: complexity -> (beta, mu, layers, MSE per coordinate).
 TABLE_I = {

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from latentds import datasets
-from latentds.diffeomorphism import WIDTH_BOUND, Layers, LocallyWeightedTranslations
 from latentds.fitting import refinement
 from latentds.fitting.embedding import map_to_endpoints, straight_column
 from latentds.fitting.matching import match
 from latentds.fitting.refinement import refine
 from latentds.testing import wavy_motion
+from latentds.translations import WIDTH_BOUND, Layers, LocallyWeightedTranslations
 
 
 def pairs(dim, count=120):

@@ -21,8 +21,8 @@ import torch.autograd.forward_ad as forward_ad
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from latentds import ChebyshevDS, LocallyWeightedTranslations, datasets, warmup
-from latentds.diffeomorphism import WIDTH_BOUND
 from latentds.kernels import compiling, dispatch, lanes, translations
+from latentds.translations import WIDTH_BOUND
 
 OPERATIONS = ("forward", "inverse", "jacobian")
 

@@ -10,8 +10,8 @@ import torch
 from scipy.optimize import brentq
 
 from baselines.couplings import AffineCouplings
-from latentds import LocallyWeightedTranslations, diffeomorphism
-from latentds.diffeomorphism import WIDTH_BOUND
+from latentds import LocallyWeightedTranslations, translations
+from latentds.translations import WIDTH_BOUND
 
 
 def random_psi(dim, n_layers=12, strength=1.0, seed=3):
@@ -124,7 +124,7 @@ def test_eight_steps_find_every_root(dtype, early, monkeypatch):
     Where a reaches the bound e/2, p is 0 and τ is 2, the root is threefold.
     """
     if not early:
-        monkeypatch.setattr(diffeomorphism, "_everywhere", lambda done: False)
+        monkeypatch.setattr(translations, "_everywhere", lambda done: False)
     eps = torch.finfo(dtype).eps
     a = math.e / 2 * torch.cat([1 - torch.logspace(-17, -0.1, 30, dtype=torch.float64), torch.logspace(-40, -1, 5)])
     p = torch.cat([torch.zeros(1), torch.logspace(-17, 2, 60, dtype=torch.float64)])
@@ -133,7 +133,7 @@ def test_eight_steps_find_every_root(dtype, early, monkeypatch):
     a, p, tau = torch.meshgrid(a.double(), p.double(), tau.double(), indexing="ij")
     s0 = tau / (2 * a).sqrt()
     a, b, c = (part.to(dtype) for part in (a, a * s0, p + a * s0.square()))
-    s = diffeomorphism._solve(a, b, c)
+    s = translations._solve(a, b, c)
     a, b, c, s = (part.numpy().astype(np.longdouble) for part in (a, b, c, s))
     with np.errstate(over="ignore", invalid="ignore"):
         k = np.exp(np.minimum(s * (2 * b - a * s) - c, 0))
