@@ -10,7 +10,6 @@ import os
 import re
 import struct
 import zlib
-from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import files
+from .. import files
 
 Table = dict[str, NDArray[Any]]
 """A recording as it stands: scalars, (N,) and (N, k) arrays, numbers and text, by name; "" if it has none."""
@@ -84,46 +83,34 @@ def _series(series: Any) -> NDArray[Any]:
     return np.array([float("nan" if c is None or str(c) in ("<NA>", "NaT") else c) for c in cells])
 
 
+Row = tuple[int, list[str]]
+"""The number of a line, from 1, and its cells."""
+COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
+DATE = re.compile(r"(\d{4}-\d\d-\d\d)?[T ]?(\d{1,2}:\d\d:\d\d([.,]\d+)?)(Z|[+-]00:?00)?")
+MISSING_CELLS = {"", "na", "n/a", "nan", "null", "none", "-", "--"}
+
+
 def _read_text(data: bytes) -> Table:
-    numbered = [(i, line.rstrip("\r\n")) for i, line in enumerate(io.StringIO(_decoded(data), newline=None), 1)]
-    hint = [line for _, line in numbered[:1] if re.fullmatch(r"sep=.", line)]
-    comments = [(i, line.strip()) for i, line in numbered if line.lstrip().startswith(("#", "%", "//"))]
-    skipped = {i for i, _ in comments} | ({1} if hint else set())
-    body = [(i, line) for i, line in numbered if i not in skipped and line.strip(" \t,;\x1a")]
+    lines = [(i, line.rstrip("\n")) for i, line in enumerate(io.StringIO(_decoded(data), newline=None), 1)]
+    separator = re.fullmatch("sep=(.)", lines[0][1]) if lines else None
+    lines = lines[1:] if separator else lines
+    comments = {i: line.strip() for i, line in lines if line.lstrip().startswith(("#", "%", "//"))}
+    body = [(i, line) for i, line in lines if i not in comments and line.strip(" \t,;\x1a")]
     if not body:
         raise ValueError("no rows")
-    delimiter = hint[0][-1] if hint else _delimiter(body[-1][1])
-    rows = [(i, _cells(line, delimiter)) for i, line in body]
-    start = next(
-        (k for k, (_, row) in enumerate(rows) if 2 * sum(map(_is_value, row)) >= max(1, sum(map(bool, row)))), None
-    )
-    if start is None:
-        raise ValueError("no row of numbers")
-    lead, rows = rows[:start], rows[start:]
-    if all(len(row) > 1 and not row[-1] for _, row in rows):  # a delimiter at the end of each line
-        rows = [(i, row[:-1]) for i, row in rows]
-    width = len(rows[0][1])
-    for i, row in rows:
-        if len(row) != width:
-            raise ValueError(f"line {i} has {len(row)} cells, the first of numbers {width}")
-    names = _header(lead, comments, rows[0][0], width, delimiter)
-    table = {}
-    cells = [[row[k] for _, row in rows] for k in range(width)]
-    comma = _decimal_comma(cells, delimiter)
-    for k, column in enumerate(cells):
-        name = names[k] if names else str(k)
-        array = _column([c.replace(",", ".") for c in column] if comma and "[" not in column[0] else column)
-        if array.dtype.kind == "U" and array.ndim == 1:
-            numbers = [_is_value(c) for c in column]
-            if any(numbers) and not all(not c or n for c, n in zip(column, numbers, strict=True)):
-                bad = numbers.index(False)
-                raise ValueError(f"line {rows[bad][0]}: {column[bad]!r} among the numbers of column {name!r}")
-        table[name] = array
+    delimiter = separator[1] if separator else _delimiter(body[-1][1])
+    lead, rows = _at_the_first_of_numbers([(i, _cells(line, delimiter)) for i, line in body])
+    numbers, width = [i for i, _ in rows], len(rows[0][1])
+    names = _header(lead, [text for i, text in comments.items() if i < numbers[0]], width, delimiter)
+    columns = [[row[k] for _, row in rows] for k in range(width)]
+    comma = _decimal_comma(columns, delimiter)
+    named = zip(names or map(str, range(width)), columns, strict=True)
+    table = {name: _parsed(name, cells, numbers, comma) for name, cells in named}
     if names:
         return table
-    first = rows[0][1]
-    if width > 2 and first == [str(k) for k in range(width)] and all("." in c for _, row in rows[1:] for c in row):
-        raise ValueError(f"line {rows[0][0]} numbers the columns: expected names in it, or none")
+    numbered = width > 2 and rows[0][1] == list(table)
+    if numbered and all("." in cell for _, row in rows[1:] for cell in row):
+        raise ValueError(f"line {numbers[0]} numbers the columns: expected names in it, or none")
     return _joined(table)
 
 
@@ -139,18 +126,11 @@ def _decoded(data: bytes) -> str:
     return text
 
 
-COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
-DATE = re.compile(r"(\d{4}-\d\d-\d\d)?[T ]?(\d{1,2}:\d\d:\d\d([.,]\d+)?)(Z|[+-]00:?00)?")
-MISSING = {"", "na", "n/a", "nan", "null", "none", "-", "--"}
-
-
 def _delimiter(line: str) -> str:
     """What separates the cells of a line of numbers: a tab, a semicolon, a comma or blanks."""
     outside = re.sub(r'"[^"]*"|\[[^\]]*\]|\([^)]*\)', "0", line.strip())
-    if "\t" in outside:
-        return "\t"
-    if ";" in outside:
-        return ";"
+    if mark := next((mark for mark in "\t;" if mark in outside), ""):
+        return mark
     words = outside.split()
     decimal = len(words) > 1 and all(re.fullmatch(r"[+-]?\d+(,\d+)?([eE][+-]?\d+)?", w) for w in words)
     return "," if "," in outside and not decimal else " "
@@ -163,53 +143,59 @@ def _cells(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in row]
 
 
-def _header(
-    lead: list[tuple[int, list[str]]], comments: list[tuple[int, str]], first: int, width: int, delimiter: str
-) -> list[str]:
+def _at_the_first_of_numbers(rows: list[Row]) -> tuple[list[Row], list[Row]]:
+    """The rows above the numbers, and those of numbers, all as wide."""
+    shares = [(sum(map(_is_value, row)), sum(map(bool, row))) for _, row in rows]
+    start = next((k for k, (values, filled) in enumerate(shares) if 2 * values >= max(1, filled)), None)
+    if start is None:
+        raise ValueError("no row of numbers")
+    lead, rows = rows[:start], rows[start:]
+    if all(len(row) > 1 and not row[-1] for _, row in rows):  # a delimiter at the end of each line
+        rows = [(i, row[:-1]) for i, row in rows]
+    width = len(rows[0][1])
+    if ragged := [(i, row) for i, row in rows if len(row) != width]:
+        raise ValueError(f"line {ragged[0][0]} has {len(ragged[0][1])} cells, the first of numbers {width}")
+    return lead, rows
+
+
+def _header(lead: list[Row], comments: list[str], width: int, delimiter: str) -> list[str]:
     """Names of the columns: from the lines above the numbers, or from the last comment there; empty if none."""
-    trimmed = [(i, row[:-1] if len(row) == width + 1 and not row[-1] else row) for i, row in lead]
-    fitting = [row for _, row in trimmed if len(row) == width]
-    if trimmed and (len(fitting) > 2 or (len(trimmed[-1][1]) not in (1, width))):
-        i, row = trimmed[-1]
-        raise ValueError(
-            f"line {i} names {len(row)} columns, the numbers have {width}"
-            if len(row) != width
-            else f"{len(fitting)} header lines above the numbers, expected one, and one of units at most"
-        )
-    if len(fitting) == 2:  # the second names units
-        units = [re.sub(r"[\[\]()]", "", cell) for cell in fitting[1]]
-        fitting = [[f"{name} [{unit}]" if unit else name for name, unit in zip(fitting[0], units, strict=True)]]
-    above = [text.lstrip("#%/ ") for i, text in comments if i < first]
-    if not fitting and above:
-        row = next((r for d in (delimiter, " ") if len(r := _cells(above[-1], d)) == width), [])
-        fitting = [row] if row and not any(map(_is_value, row)) else []
-    return _distinct([name or f"column {k}" for k, name in enumerate(fitting[0])]) if fitting else []
+    lead = [(i, row[:-1] if len(row) == width + 1 and not row[-1] else row) for i, row in lead]
+    headers = [row for _, row in lead if len(row) == width]
+    if lead and len(lead[-1][1]) not in (1, width):
+        raise ValueError(f"line {lead[-1][0]} names {len(lead[-1][1])} columns, the numbers have {width}")
+    if len(headers) > 2:
+        raise ValueError(f"{len(headers)} header lines above the numbers, expected one, and one of units at most")
+    if len(headers) == 2:  # the second names units
+        units = [re.sub(r"[\[\]()]", "", cell) for cell in headers[1]]
+        headers = [[f"{name} [{unit}]" if unit else name for name, unit in zip(headers[0], units, strict=True)]]
+    if not headers and comments:
+        last = comments[-1].lstrip("#%/ ")
+        headers = [row for d in (delimiter, " ") if len(row := _cells(last, d)) == width][:1]
+        headers = [row for row in headers if not any(map(_is_value, row))]
+    return _distinct([name or f"column {k}" for k, name in enumerate(headers[0])]) if headers else []
 
 
 def _distinct(names: list[str]) -> list[str]:
-    seen: Counter[str] = Counter()
-    found = []
-    for name in names:
-        seen[name] += 1
-        found.append(name if seen[name] == 1 else f"{name} ({seen[name]})")
-    return found
+    """Names that occur again with their count behind them."""
+    return [f"{name} ({n})" if (n := names[: k + 1].count(name)) > 1 else name for k, name in enumerate(names)]
 
 
-def _decimal_comma(cells: list[list[str]], delimiter: str) -> bool:
+def _decimal_comma(columns: list[list[str]], delimiter: str) -> bool:
     """Whether numbers are written 0,5; a ValueError if a comma stands for both."""
-    flat = [cell for column in cells for cell in column]
-    if delimiter == "," and any(re.fullmatch(r"[+-]?0\d+", cell) for cell in flat):
+    cells = [cell for column in columns for cell in column]
+    if delimiter == "," and any(re.fullmatch(r"[+-]?0\d+", cell) for cell in cells):
         raise ValueError("decimal commas between commas cannot be told apart: expected another delimiter")
-    if not any(COMMA_NUMBER.fullmatch(cell) for cell in flat):
+    if not any(map(COMMA_NUMBER.fullmatch, cells)):
         return False
-    if mixed := [c for c in flat if "." in c and _is_value(c) and not DATE.fullmatch(c) and c[:1] not in "[("]:
-        raise ValueError(f"numbers with a decimal comma and, as {mixed[0]!r}, with a point")
+    if pointed := [c for c in cells if "." in c and _is_value(c) and not DATE.fullmatch(c) and c[:1] not in "[("]:
+        raise ValueError(f"numbers with a decimal comma and, as {pointed[0]!r}, with a point")
     return True
 
 
 def _is_value(cell: str) -> bool:
     """Whether a cell is a number, a list or a date, and not a name."""
-    if cell[:1] in ("[", "(") or cell.startswith("array(") or DATE.fullmatch(cell):
+    if _is_list(cell) or DATE.fullmatch(cell):
         return bool(re.search(r"\d", cell))
     try:
         float(cell.replace(",", ".", 1))
@@ -218,15 +204,28 @@ def _is_value(cell: str) -> bool:
     return "_" not in cell
 
 
+def _is_list(cell: str) -> bool:
+    return cell.startswith(("[", "(", "array("))
+
+
+def _parsed(name: str, cells: list[str], lines: list[int], comma: bool) -> NDArray[Any]:
+    """A column, whose cells stand in ``lines``; a ValueError if some are words among numbers."""
+    column = _column([cell.replace(",", ".") for cell in cells] if comma and "[" not in cells[0] else cells)
+    if column.dtype.kind == "U" and column.ndim == 1:
+        values = [_is_value(cell) for cell in cells]
+        if any(values) and any(cell and not value for cell, value in zip(cells, values, strict=True)):
+            row = values.index(False)
+            raise ValueError(f"line {lines[row]}: {cells[row]!r} among the numbers of column {name!r}")
+    return column
+
+
 def _column(cells: list[str]) -> NDArray[Any]:
     """Cells of text as (N,) numbers, times or text, or (N, k) numbers or text if they are lists."""
-    if all(DATE.fullmatch(cell) for cell in cells) and cells:
-        found = [DATE.fullmatch(cell.replace(",", ".")) for cell in cells]
-        return np.array(
-            [f"{m[1] or '1970-01-01'}T{'0' * (m[2][1] == ':')}{m[2]}" if m else "NaT" for m in found],
-            dtype="datetime64[ns]",
-        )
-    if all(cell[:1] in ("[", "(") or cell.startswith("array(") for cell in cells):
+    dates = [DATE.fullmatch(cell.replace(",", ".")) for cell in cells]
+    if all(dates):
+        iso = [f"{m[1] or '1970-01-01'}T{'0' * (m[2][1] == ':')}{m[2]}" for m in dates if m]
+        return np.array(iso, dtype="datetime64[ns]")
+    if all(map(_is_list, cells)):
         inside = [re.sub(r"^[^\[(]*[\[(]+('[a-z]', *\[)?|[\])]+$", "", cell) for cell in cells]
         lists = [[item.strip("'\" ") for item in re.split(r"[,;\s]+", text.strip()) if item] for text in inside]
         if len({len(row) for row in lists}) != 1:
@@ -238,7 +237,7 @@ def _column(cells: list[str]) -> NDArray[Any]:
     try:
         if any("_" in cell for cell in cells):
             raise ValueError
-        return np.array([math.nan if cell.lower() in MISSING else float(cell) for cell in cells])
+        return np.array([math.nan if cell.lower() in MISSING_CELLS else float(cell) for cell in cells])
     except ValueError:
         return np.array(cells, dtype=str)
 
@@ -246,7 +245,7 @@ def _column(cells: list[str]) -> NDArray[Any]:
 def _joined(table: Table) -> Table:
     """Columns without names as one array without a name."""
     arrays = list(table.values())
-    if not all(a.ndim == 1 and a.dtype.kind in "fiu" for a in arrays):
+    if not arrays or not all(a.ndim == 1 and a.dtype.kind in "fiu" for a in arrays):
         return table
     return {"": np.stack(arrays, axis=1)}
 
@@ -259,19 +258,19 @@ def _read_npy(data: bytes) -> Table:
 
 
 def _read_npz(data: bytes) -> Table:
-    found, pickled = {}, []
+    arrays, pickled = {}, []
     with np.load(io.BytesIO(data), allow_pickle=False) as file:
         size = sum(entry.file_size for entry in file.zip.infolist())  # unpacked
         if size > files.MAX_BYTES:
             raise ValueError(f"holds {size} bytes, more than {files.MAX_BYTES}")
         for key in file.files:
             try:
-                found[key] = file[key]
+                arrays[key] = file[key]
             except ValueError as error:
                 if "allow_pickle" not in str(error):
                     raise
                 pickled.append(key)
-    table = _flattened({k: a for k, a in found.items() if isinstance(a, np.ndarray)})
+    table = _flattened({k: a for k, a in arrays.items() if isinstance(a, np.ndarray)})
     if pickled and not any(a.ndim for a in table.values()):
         raise ValueError(f"pickled: {', '.join(pickled)}")
     return table
