@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 ROOMS = (
-    "arguments", "curves", "tabulated", "memo", "files", "recordings", "demonstration", "datasets",
+    "arguments", "curves", "tabulated", "memo", "files", "recordings", "readers", "demonstration", "datasets",
     "time_law", "kernels", "diffeomorphism", "transform", "dynamics", "deploy", "integrate", "metrics", "fidelity",
     "fitting", "wrappers", "base", "methods", "storage", "cache", "certificate", "testing", "cell", "benchmark",
     "plotting", "report", "cli", "__main__",
