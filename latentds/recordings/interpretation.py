@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..arguments import Array, positive
 from . import vocabulary
 from .readers import Table, counts_rows
-from .vocabulary import POSITION_KINDS, UNIT_WORDS, UNITS
+from .vocabulary import POSITION_KINDS, UNITS, has_word, is_step, kind_of
 
 Names = str | int | Sequence[str | int]
 """Of a column, or of an array with all its columns, or a column's number from 0; or several."""
@@ -81,7 +81,7 @@ def interpret(
     Raises:
         ValueError: if it is ambiguous, names the argument that settles it and says what was seen.
     """
-    if unit is not None and not (isinstance(unit, str) and unit in UNIT_WORDS):
+    if unit is not None and not (isinstance(unit, str) and unit in vocabulary.UNIT_WORDS):
         raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
     if dt is not None:
         dt = positive(dt, "dt")
@@ -95,7 +95,7 @@ class _Interpretation:
 
     def __init__(self, table: Table, label: str, unit: str | None) -> None:
         self.label = label
-        self.unit = unit and UNIT_WORDS[unit]
+        self.unit = unit and vocabulary.UNIT_WORDS[unit]
         self.remarks: list[str] = []
         self.ours = list(table) == ["t [s]", *(f"y{i}" for i in range(len(table) - 1))]
         self.ours |= set(table) - {"columns"} == {"positions", "dt", "name"}
@@ -131,10 +131,11 @@ class _Interpretation:
         if columns is None:
             chosen = [c for c in chosen if c.name not in timing.columns]
             self._ask_about_shape(chosen, count)
-            if all(c.kind == "unknown" for c in chosen):
-                self._ask_about_derivatives(chosen, timing)
         elif any(self.arrays[c.block].ndim == 2 and count < self.arrays[c.block].shape[1] for c in chosen):
             self._ask_about_shape([c for c in self.columns if c.block == chosen[0].block], count)
+        positions = np.stack([c.values for c in chosen], axis=1)
+        if columns is None and all(c.kind == "unknown" for c in chosen):
+            self._ask_about_derivatives(chosen, positions, timing)
         used = {c.name for c in chosen} | set(timing.columns)
         parts = [f"{count} rows", timing.text, f"positions {_listed(chosen)}"]
         if unused := [c for c in self.columns if c.name not in used]:
@@ -143,12 +144,12 @@ class _Interpretation:
         if not all(labels) or len(set(labels)) < len(labels) or (self.ours and "columns" not in self.texts):
             labels = ()
         origin = f"{self.label}: {'; '.join([*parts, *self.remarks])}"
-        return Motion(_stacked(chosen), timing.times, timing.dt, labels, origin)
+        return Motion(positions, timing.times, timing.dt, labels, origin)
 
     # Columns -------------------------------------------------------------------------------------------------------
 
     def _columns_of(self, block: str) -> list[_Column]:
-        array, kind, dated = self.arrays[block], vocabulary.kind_of(block), None
+        array, kind, dated = self.arrays[block], kind_of(block), None
         if array.dtype.kind in "Mm":
             array, kind, dated = (array - array[0]) / np.timedelta64(1, "ns") * 1e-9, "time", "s"
         labels = names = [block]
@@ -166,7 +167,7 @@ class _Interpretation:
         """Names of an array's columns, if the file gives them beside it."""
         for name, text in self.texts.items():
             rows = text if text.ndim == 2 else text[None]
-            if vocabulary.is_list_of_labels(name) and rows.shape[-1] == count == len(set(rows[0])):
+            if has_word(name, vocabulary.LABEL_WORDS) and rows.shape[-1] == count == len(set(rows[0])):
                 if (rows != rows[0]).any():
                     self._ask("columns", f"expected one order of names, which change in {name!r} from row to row")
                 return [str(label) for label in rows[0]]
@@ -176,10 +177,8 @@ class _Interpretation:
         """The columns of these names and numbers, of all columns of an array if it is the array's name."""
         columns: list[_Column] = []
         for name in wanted:
-            match: list[_Column] = []
-            if isinstance(name, str):
-                match = [c for c in self.columns if c.name == name] or [c for c in self.columns if c.block == name]
-            elif isinstance(name, (int, np.integer)) and not isinstance(name, bool) and name >= 0:
+            match = [c for c in self.columns if c.name == name] or [c for c in self.columns if c.block == name]
+            if isinstance(name, (int, np.integer)) and not isinstance(name, bool) and name >= 0:
                 match = self.columns[name : name + 1]
             if not match:
                 self._ask(argument, f"expected names or numbers of columns, got {name!r}")
@@ -189,7 +188,7 @@ class _Interpretation:
     def _positions(self, columns: list[_Column]) -> list[_Column]:
         """The columns that are positions by their names, or those whose names say nothing at all."""
         for name, text in self.texts.items():
-            kind = "labels" if vocabulary.is_list_of_labels(name) else vocabulary.kind_of(name)
+            kind = "labels" if has_word(name, vocabulary.LABEL_WORDS) else kind_of(name)
             if text.ndim == 1 and len(text) > 2 and kind in POSITION_KINDS:
                 raise ValueError(f"path: {self.label} is not a table of numbers ({str(text[0])!r} in column {name!r})")
         named = [c for c in columns if c.kind in POSITION_KINDS]
@@ -240,7 +239,7 @@ class _Interpretation:
         if named := self._named_stamps(count, set() if free else {c.name for c in chosen}):
             timing = self._in_seconds(self._one_of(named), "")
             timing = timing._replace(columns=timing.columns + self._row_numbers(unnamed))
-            self._ask_about_two_answers(timing)
+            self._ask_about_two_answers(timing.times)
             return timing
         if (stated := self._stated_dt(count)) is not None:
             name, steps = stated
@@ -271,15 +270,11 @@ class _Interpretation:
         stamps = [c for c in self.columns if c.kind == "time" and len(c.values) == count and c.name not in taken]
         for whole in [s for s in stamps if s.unit == "s"]:
             for rest in [s for s in stamps if s.unit == "ns"]:
-                # Whole seconds with nanoseconds beside them, as ROS writes stamps.
-                if (
-                    vocabulary.words_of(whole.name)[:-1] != vocabulary.words_of(rest.name)[:-1]
-                    or rest.values.max() >= 1e9
-                ):
-                    continue
-                values = whole.values - whole.values[0] + 1e-9 * rest.values
-                stamps = [s for s in stamps if s not in (whole, rest)]
-                stamps.append(replace(whole, name=f"{whole.name} + {rest.name}", values=values))
+                siblings = vocabulary.words_of(whole.name)[:-1] == vocabulary.words_of(rest.name)[:-1]
+                if siblings and rest.values.max() < 1e9:  # whole seconds with nanoseconds beside, as ROS writes them
+                    values = whole.values - whole.values[0] + 1e-9 * rest.values
+                    both = replace(whole, name=f"{whole.name} + {rest.name}", values=values)
+                    stamps = [*(s for s in stamps if s not in (whole, rest)), both]
         return stamps
 
     def _one_of(self, named: list[_Column]) -> _Column:
@@ -290,7 +285,7 @@ class _Interpretation:
             if max(durations) > 1.01 * min(durations):
                 names = ", ".join(repr(s.name) for s in named)
                 self._ask("time", f"expected one column of time, got {names}, which differ")
-        return next((s for s in named if {"stamp", "stamps"} & set(vocabulary.words_of(s.name))), named[0])
+        return next((s for s in named if has_word(s.name, {"stamp", "stamps"})), named[0])
 
     def _in_seconds(self, stamps: _Column, how: str) -> _Timing:
         name, values = stamps.name, stamps.values
@@ -334,12 +329,12 @@ class _Interpretation:
     def _stated_dt(self, count: int) -> tuple[str, float | Array] | None:
         """The time between rows, or their times as the sum of a column of steps, and what states it."""
         for name, text in self.texts.items():
-            if vocabulary.is_step(name) and text.ndim == 0:
+            if is_step(name) and text.ndim == 0:
                 raise ValueError(f"dt: expected a number in {self.label}, got {str(text)!r}")
         for name, array in {**self.scalars, **self.arrays}.items():
             if array.dtype.kind in "Mm":
                 continue
-            if vocabulary.is_step(name):
+            if is_step(name):
                 steps = np.asarray(array, dtype=np.float64)
                 if steps.ndim == 0:
                     return name, positive(steps.item(), "dt")
@@ -349,7 +344,7 @@ class _Interpretation:
                 if steps.shape == (count,) and np.ptp(steps) <= 0.5 * abs(steps.mean()):
                     return name, np.concatenate([[0.0], np.cumsum(steps[1:])])
                 self._ask("dt", f"expected one number or one step per row, got shape {steps.shape} in {name!r}")
-            if array.ndim == 0 and vocabulary.is_rate(name):
+            if array.ndim == 0 and has_word(name, vocabulary.RATE_WORDS):
                 return name, 1 / positive(array.item(), name)
         return None
 
@@ -360,14 +355,13 @@ class _Interpretation:
             low, high = EVERYDAY_STEP
             self._ask("dt", f"expected {low:g} to {high:g} s between rows, got {dt:g} from {name!r}: {count} rows")
 
-    def _ask_about_two_answers(self, timing: _Timing) -> None:
+    def _ask_about_two_answers(self, times: Any) -> None:
         """A column of time, and a scalar that says otherwise."""
-        for name, scalar in self.scalars.items():
-            if timing.times is not None and vocabulary.is_step(name) and scalar.dtype.kind in "fiu":
-                mean = timing.times[-1] / (len(timing.times) - 1)
-                if not _within(float(scalar) / mean, (0.95, 1.05)):
-                    answers = f"{mean:.4g} s a row by the time, {float(scalar):g} by {name!r}"
-                    self._ask("time", f"expected one answer, got {answers}")
+        mean = float(np.mean(np.diff(times)))
+        steps = {name: float(s) for name, s in self.scalars.items() if is_step(name) and s.dtype.kind in "fiu"}
+        for name, step in steps.items():
+            if not _within(step / mean, (0.95, 1.05)):
+                self._ask("time", f"expected one answer, got {mean:.4g} s a row by the time, {step:g} by {name!r}")
 
     def _ask_about_sets(self, positions: list[_Column]) -> None:
         """Columns and arrays that are more than one joint vector, one position, or one pose."""
@@ -375,7 +369,7 @@ class _Interpretation:
         kinds = {c.kind for c in positions}
         pose = kinds in ({"Cartesian", "orientation"}, {"position", "orientation"})
         whole = len(kinds) == 1 or pose or kinds == {"Cartesian", "orientation", "position"}
-        one_each = len(set(map(vocabulary.kind_of, dims))) == len(dims) and len({len(c.values) for c in positions}) == 1
+        one_each = len(set(map(kind_of, dims))) == len(dims) and len({len(c.values) for c in positions}) == 1
         if len(dims) > 1 and not (whole and set(dims.values()) == {1}) and not (pose and one_each):
             self._ask("columns", f"expected one set of positions, got {self._shapes(dims)}")
 
@@ -390,9 +384,8 @@ class _Interpretation:
             most = f"at most {ASK_ABOVE_COLUMNS} unless they are named"
             self._ask("columns", f"expected {most}, got {len(chosen)} columns")
 
-    def _ask_about_derivatives(self, chosen: list[_Column], timing: _Timing) -> None:
+    def _ask_about_derivatives(self, chosen: list[_Column], values: Array, timing: _Timing) -> None:
         """Unnamed columns of which a half or a third is the derivative of the one before are more than positions."""
-        values = _stacked(chosen)
         if len(values) < 5 or not np.isfinite(values).all():
             return
         spacing: Any = timing.dt if timing.times is None else timing.times
@@ -421,10 +414,6 @@ def _squeezed(array: NDArray[Any]) -> NDArray[Any]:
     return array.reshape(-1) if array.ndim == 2 and 1 in array.shape and array.size > 1 else array
 
 
-def _stacked(columns: Sequence[_Column]) -> Array:
-    return np.stack([c.values for c in columns], axis=1)
-
-
 def _is_even(values: Array) -> bool:
     """Whether numbers rise strictly and in nearly equal steps."""
     steps = np.diff(values)
@@ -442,10 +431,10 @@ def _within(value: float, interval: tuple[float, float]) -> bool:
 def _listed(columns: Sequence[_Column]) -> str:
     """Names, those of the numbered columns of an array in one."""
     names: list[str] = []
-    for block, run in itertools.groupby(columns, lambda c: c.block if not c.label else c):
-        numbered = [c.name for c in run]
-        together = block and isinstance(block, str) and len(numbered) > 1
-        names += [f"{block}[…] ({len(numbered)})"] if together else numbered
+    for block, run in itertools.groupby(columns, lambda c: c.block):
+        same = list(run)
+        numbered = len(same) > 1 and block and not same[0].label
+        names += [f"{block}[…] ({len(same)})"] if numbered else [c.name for c in same]
     return _shortened(names)
 
 

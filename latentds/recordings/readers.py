@@ -302,10 +302,6 @@ def _check_unpacked(data: bytes) -> None:
         at += 8 + length
 
 
-def _read_json(data: bytes) -> Table:
-    return _flattened(json.loads(_decoded(data)))
-
-
 def _flattened(value: Any, name: str = "") -> Table:
     """Nested mappings and lists as one table; the names of nested ones are joined by a slash."""
     if isinstance(value, np.ndarray) and value.dtype.names:
@@ -337,5 +333,5 @@ READERS: dict[str, tuple[Callable[[bytes], Table], str]] = {
     ".npy": (_read_npy, "a readable .npy without pickles"),
     ".npz": (_read_npz, "a readable .npz without pickles"),
     ".mat": (_read_mat, "a readable .mat"),
-    ".json": (_read_json, "a readable .json of numbers"),
+    ".json": (lambda data: _flattened(json.loads(_decoded(data))), "a readable .json of numbers"),
 }

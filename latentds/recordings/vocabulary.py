@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Set
 
 
 def _vocabulary(words: str) -> frozenset[str]:
@@ -89,14 +90,8 @@ def is_step(name: str) -> bool:
     return "_".join(_without_units(words_of(name))) in STEP_NAMES
 
 
-def is_rate(name: str) -> bool:
-    """Whether a name is that of the rows in a second."""
-    return bool(RATE_WORDS & set(words_of(name)))
-
-
-def is_list_of_labels(name: str) -> bool:
-    """Whether a name is that of a list of names."""
-    return bool(LABEL_WORDS & set(words_of(name)))
+def has_word(name: str, words: Set[str]) -> bool:
+    return not words.isdisjoint(words_of(name))
 
 
 def unit_in(name: str) -> str | None:
