@@ -180,15 +180,24 @@ def family(count=5, *, end_apart=0.0, power=1):
     return found
 
 
-def test_several_are_followed_better_than_one():
+@pytest.fixture(scope="module")
+def together():
+    return fast(2).fit(family())
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return fast(2).fit(family()[0])
+
+
+def test_several_are_followed_better_than_one(together, alone):
     shown = family()
-    together, alone = fast(2).fit(shown), fast(2).fit(shown[0])
     scores = np.array([[dtw(rolled(ds, d), d.positions) / len(d) for d in shown[1:]] for ds in (together, alone)])
     assert scores[0].mean() < 0.7 * scores[1].mean()
 
 
 def test_several_agree_on_a_goal_and_report_their_spread():
-    shown = family(end_apart=0.02)
+    shown = family(3, end_apart=0.02)
     ds = fast(2).fit(shown)
     goals = torch.stack([d.goal for d in shown])
     torch.testing.assert_close(ds.attractor, goals.mean(0))
@@ -226,8 +235,8 @@ def test_the_mean_does_not_smear_a_corner_that_all_took_at_another_time():
 @pytest.mark.slow
 def test_several_make_the_map_near_isometric_across_the_path():
     """Points at a distance from the path encode to that distance from the axis, in the scale of the axis."""
-    shown = family()
-    ds = TubeDS(2, n_layers=150).fit(shown)
+    shown = family(3)
+    ds = TubeDS(2, n_layers=80).fit(shown)
     mean = mean_motion(shown)[0]
     path, tangents = mean.positions[30:-30:10], torch.nn.functional.normalize(mean.velocities[30:-30:10], dim=-1)
     across = torch.stack([-tangents[:, 1], tangents[:, 0]], dim=1)
@@ -242,19 +251,17 @@ def test_several_make_the_map_near_isometric_across_the_path():
         assert ratio.max() < 1.33
 
 
-def test_the_contraction_is_read_unless_it_is_asked_for():
-    shown = family()
-    read, asked = fast(2).fit(shown), TubeDS(2, refined=False, contraction=9.0).fit(shown)
-    assert 1 <= read.fit_report.contraction < 9
+def test_the_contraction_is_read_unless_it_is_asked_for(together, alone):
+    asked = fast(2, contraction=9.0).fit(family(2))
+    assert 1 <= together.fit_report.contraction < 9
     assert asked.fit_report.contraction == 9
-    assert read.contraction is None
-    assert fast(2).fit(shown[0]).fit_report.contraction == 20
-    assert fast(2).fit(family(power=12)).fit_report.contraction > read.fit_report.contraction
+    assert together.contraction is None
+    assert alone.fit_report.contraction == 20
+    assert fast(2).fit(family(power=12)).fit_report.contraction > together.fit_report.contraction
 
 
-def test_each_of_several_keeps_its_own_time():
-    shown = family()
-    ds = fast(2).fit(shown)
+def test_each_of_several_keeps_its_own_time(together):
+    shown, ds = family(), together
     with torch.no_grad():
         left = ds.dynamics.law.time_to_go(
             ds.dynamics.phase(ds.encode(torch.stack([d.start for d in shown])), ds.frame())
