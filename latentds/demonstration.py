@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from . import files, readers, recordings
+from . import files, recordings
 from .arguments import Array, point_array, positive, real_array
 from .curves import extent, interpolated
 
@@ -174,11 +174,11 @@ class Demonstration:
             FileNotFoundError: if there is no such file.
         """
         path = Path(path)
-        table = readers.read_table(path)
+        table = recordings.read_table(path)
         if name is None:
             saved = table.get("name", np.array(0))
             name = str(saved) if saved.ndim == 0 and saved.dtype.kind == "U" else path.stem
-        motion = recordings.understand(table, path.name, columns=columns, time=time, unit=unit, dt=dt)
+        motion = recordings.interpret(table, path.name, columns=columns, time=time, unit=unit, dt=dt)
         return cls._of(motion, name)
 
     @classmethod
@@ -193,8 +193,8 @@ class Demonstration:
         name: str = "",
     ) -> Demonstration:
         """What :meth:`load` does, for a pandas frame or a mapping from names to arrays that is at hand already."""
-        known = readers.as_table(table)
-        motion = recordings.understand(known, name or "the table", columns=columns, time=time, unit=unit, dt=dt)
+        known = recordings.as_table(table)
+        motion = recordings.interpret(known, name or "the table", columns=columns, time=time, unit=unit, dt=dt)
         return cls._of(motion, name)
 
     @classmethod

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from scipy.integrate import solve_ivp
 
 from latentds.dynamics import Frame, LatentDynamics, RayDynamics, TubeDynamics
 from latentds.time_law import ChebyshevLaw, PiecewiseLinearLaw
+from tests.motions import tensor
 
 FAST = PiecewiseLinearLaw([0.1, 1.0], [1.0, 10.0])
 SLOW = PiecewiseLinearLaw([0.1, 0.4, 1.0], [0.2, 0.05, 0.9])
@@ -95,3 +98,43 @@ def test_dynamics_without_a_velocity_or_a_flow_are_none(missing):
     methods = {name: getattr(RayDynamics, name) for name in ("forward", "flow") if name != missing}
     with pytest.raises(TypeError, match=missing):
         type("Half", (LatentDynamics,), methods)()
+
+
+@pytest.mark.parametrize("dim", [1, 2, 7])
+def test_flow_agrees_with_solve_ivp(dim, draw):
+    along = PiecewiseLinearLaw(tensor([0.01, 0.4, 1.0]), tensor([0.3, 2.0, 0.7]))
+    dynamics = TubeDynamics(along, PiecewiseLinearLaw(tensor([0.2]), tensor([1.5])))
+    start, goal = torch.randn(2, dim, generator=draw, dtype=torch.float64)
+    frame = Frame.between(start, goal)
+    x = torch.cat([start[None], goal + 3 * torch.randn(5, dim, generator=draw, dtype=torch.float64)])
+    times = torch.linspace(0, 1.5, 6, dtype=torch.float64)
+    path = dynamics.flow(x, times, frame)
+    solved = solve_ivp(
+        lambda _, flat: dynamics(tensor(flat).view(x.shape), x, frame).reshape(-1).numpy(),
+        (0, 1.5), x.numpy().ravel(), "LSODA", times.numpy(), rtol=1e-10, atol=1e-12,
+    )  # fmt: skip
+    assert np.abs(solved.y.T.reshape(6, *x.shape).swapaxes(0, 1) - path.numpy()).max() < 1e-7
+    assert (dynamics.lyapunov(path, frame).diff(dim=-1) < 0).all()
+    assert (dynamics(goal, goal, frame) == 0).all()
+    torch.testing.assert_close(dynamics.flow(goal, times, frame), goal.expand(6, dim), rtol=0, atol=0)
+
+
+def test_progress_falls_by_the_law_from_wherever_it_starts(draw):
+    law = PiecewiseLinearLaw(tensor([0.01, 0.4, 1.0]), tensor([0.3, 2.0, 0.7]))
+    dynamics = TubeDynamics(law, PiecewiseLinearLaw(tensor([0.2]), tensor([1.5])))
+    start, goal, aside = torch.randn(3, 3, generator=draw, dtype=torch.float64)
+    frame = Frame.between(start, goal)
+    middle = (start + goal) / 2
+    torch.testing.assert_close(dynamics.phase(torch.stack([start, goal, middle]), frame), tensor([1, 0, 0.5]))
+    path = dynamics.flow(goal + (start - goal) * 0.9 + 0.1 * aside, tensor([0.0, 0.1]), frame)
+    s = dynamics.phase(path, frame)
+    torch.testing.assert_close(law.time_to_go(s[0]) - law.time_to_go(s[1]), tensor(0.1))
+
+
+def test_offset_shrinks_at_the_rate_and_no_faster_than_the_cap():
+    dynamics = TubeDynamics(PiecewiseLinearLaw.uniform(), PiecewiseLinearLaw(tensor([0.25]), tensor([0.25 * 8])))
+    frame = Frame.between(tensor([2.0, 0.0]), tensor([0.0, 0.0]))
+    near = dynamics.flow(tensor([1.0, 0.4]), tensor([0.0, 0.1]), frame)[:, 1]
+    torch.testing.assert_close(near[1] / near[0], tensor(math.exp(-0.8)))
+    offsets = tensor([[1.0, 0.5], [1.0, 5.0], [1.0, 500.0]])
+    torch.testing.assert_close(dynamics(offsets, offsets, frame)[:, 1], tensor([-4.0, -4.0, -4.0]))

@@ -11,6 +11,7 @@ from scipy.integrate import quad, solve_ivp
 
 from latentds.dynamics import Frame, RayDynamics
 from latentds.time_law import LINEAR_BELOW, ChebyshevLaw, PiecewiseLinearLaw
+from tests.motions import tensor
 
 
 def random_law(seed, n_knots):
@@ -155,3 +156,33 @@ def test_bad_duration(value):
 def test_bad_knots(knots, speeds, name):
     with pytest.raises(ValueError, match=f"{name}: expected"):
         PiecewiseLinearLaw(knots, speeds)
+
+
+TIMINGS = {
+    "even": (np.linspace(1, 0, 200), np.linspace(0, 2, 200)),
+    "slow start": (1 - np.linspace(0, 1, 200) ** 3, np.linspace(0, 2, 200)),
+    "pause": (np.array([1, 0.8, 0.6, 0.59, 0.3, 0.0]), np.array([0, 0.2, 0.4, 1.9, 2.2, 2.5])),
+    "rest at the start": (np.array([1, 0.999, 0.5, 0.0]), np.array([0, 3.0, 3.5, 4.0])),
+    "two points": (np.array([1.0, 0.0]), np.array([0.0, 0.7])),
+    "milliseconds": (np.linspace(1, 0, 200), np.linspace(0, 2e-3, 200)),
+}
+
+
+@pytest.mark.parametrize(("progress", "times"), TIMINGS.values(), ids=TIMINGS.keys())
+def test_a_law_takes_the_demonstrated_time(progress, times):
+    law = PiecewiseLinearLaw.from_timing(tensor(progress), tensor(times))
+    left = law.time_to_go(torch.ones(1, dtype=torch.float64))
+    s = law.progress_at(left - tensor(times))
+    # a tail of 1e-3 is all that is missing at the end
+    assert np.abs(s.numpy() - progress).max() < 0.02
+    spent = (left - law.time_to_go(tensor(np.maximum(progress, 2e-3)))).numpy()
+    assert np.abs(spent - times)[:-1].max() < 0.01 * times[-1]
+
+
+def test_above_the_start_the_speed_becomes_the_mean():
+    """What starts behind a rest is not held up by it."""
+    progress, times = TIMINGS["rest at the start"]
+    law = PiecewiseLinearLaw.from_timing(tensor(progress), tensor(times))
+    speed = law.speed(tensor([1.0, 1.02, 1.5, 10.0]))
+    assert speed[0] < 0.1 * 0.25
+    torch.testing.assert_close(speed[1:], torch.full((3,), 0.25, dtype=torch.float64))

@@ -23,7 +23,7 @@ from rich.table import Table
 from rich.text import Text
 from typer.core import TyperGroup
 
-from .. import benchmark, fidelity, readers
+from .. import benchmark, fidelity, recordings
 from ..base import FitReport, StableDS
 from ..cell import Cell, Factory, RolloutProtocol, interrupts_kept, judge
 from ..certificate import certify as certified
@@ -109,7 +109,7 @@ def fit(
     latentds fit mine.csv --method Chebyshev,n_layers=200
     """
     path = given.target(out, files, ".safetensors")
-    if path.suffix.lower() in readers.READERS:
+    if path.suffix.lower() in recordings.READERS:
         raise ValueError(f"out: expected a name that no recording has, such as mine.safetensors, got {path.name!r}")
     make = given.method_of(method)
     shown = options.read(files)

@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from .. import readers, storage
+from .. import recordings, storage
 from ..base import StableDS
 from ..cell import Factory, interrupts_kept
 from ..demonstration import Demonstration
@@ -83,7 +83,7 @@ class RecordingOptions:
         for path in paths:
             names: set[str] = set()
             if any(name.isdigit() for name in [*(self.columns or ()), self.time or ""]):
-                names = set(readers.read_table(path))  # a column called "3" is meant before the fourth one
+                names = set(recordings.read_table(path))  # a column called "3" is meant before the fourth one
             number = partial(_name_or_number, names=names)
             columns = None if self.columns is None else [number(name) for name in self.columns]
             time = None if self.time is None else number(self.time)
@@ -169,7 +169,7 @@ def _literal(text: str) -> Any:
 
 def is_system(paths: Sequence[Path]) -> bool:
     """Whether a command is given one file, and not of a kind that recordings have."""
-    return len(paths) == 1 and paths[0].suffix.lower() not in readers.READERS
+    return len(paths) == 1 and paths[0].suffix.lower() not in recordings.READERS
 
 
 def loaded(path: Path, method: str = "") -> tuple[StableDS, list[Demonstration]]:

@@ -16,7 +16,6 @@ pytestmark = pytest.mark.slow  # fits and integrates for each clause; `make test
 METHODS = {"CLFDM": lambda dim: CLFDM(dim, n_components=2, n_asymmetric=1, iterations=10, seed=0)}
 
 
-@pytest.mark.slow
 @parametrize_stable_ds(METHODS, dims=[1, 2, 7], fitted=[True])
 def test_contract(check):
     check()

@@ -29,7 +29,6 @@ def test_contract(check):
     check()
 
 
-@pytest.mark.slow
 @parametrize_stable_ds(
     {"BehaviourCloning": small}, dims=[1, 7], expected_failures={"BehaviourCloning": PROMISES_NOTHING}
 )

@@ -24,7 +24,6 @@ def test_contract(check):
     check()
 
 
-@pytest.mark.slow
 @parametrize_stable_ds({"NCDS": small}, dims=[1, 7])
 def test_contract_in_other_dimensions(check):
     check()
@@ -43,7 +42,6 @@ def test_two_motions_approach_at_the_rate(draw):
     assert torch.linalg.eigvalsh((slopes + slopes.mT) / 2).max() <= -0.5 + 1e-9
 
 
-@pytest.mark.slow
 def test_follows_what_it_was_shown():
     shown = wavy_motion(2)
     ds = small(2, n_features=100, epochs=300).fit(shown)

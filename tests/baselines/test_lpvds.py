@@ -27,7 +27,6 @@ def test_contract(check):
     check()
 
 
-@pytest.mark.slow
 @parametrize_stable_ds({"LPVDS": small}, dims=[1, 7])
 def test_contract_in_other_dimensions(check):
     check()
@@ -85,7 +84,6 @@ def test_learns_from_several_and_is_kept(tmp_path):
         assert torch.equal(copy.deepcopy(ds)(y), ds(y))
 
 
-@pytest.mark.slow
 def test_follows_a_winding_spiral():
     report = LPVDS(3, seed=0).fit(datasets.unstable_spiral(7, 500)).fit_report
     assert report.fidelity.miss < 0.08

@@ -22,7 +22,6 @@ def test_contract(check):
     check()
 
 
-@pytest.mark.slow
 @parametrize_stable_ds({"NeuralLyapunov": small}, dims=[1, 7])
 def test_contract_in_other_dimensions(check):
     check()
@@ -86,7 +85,6 @@ def test_is_saved_and_loaded(fitted, places, tmp_path):
         assert torch.equal(latentds.load(tmp_path / "ds", classes=[NeuralLyapunov])(places), fitted(places))
 
 
-@pytest.mark.slow
 def test_follows_what_it_was_shown():
     shown = wavy_motion(2)
     assert small(2, epochs=400, n_units=48).fit(shown).fit_report.fidelity.miss < 0.02

@@ -21,7 +21,6 @@ def test_contract(check):
     check()
 
 
-@pytest.mark.slow
 @parametrize_stable_ds(METHODS, dims=[1, 7], fitted=[True])
 def test_contract_in_other_dimensions(check):
     check()
@@ -61,7 +60,6 @@ def test_velocity_is_the_mixture_of_linear_systems():
     np.testing.assert_allclose(found, wanted * float(ds.size / ds.duration), rtol=1e-9)
 
 
-@pytest.mark.slow
 def test_it_learns_what_comes_nearer_to_the_goal_and_cannot_learn_a_spiral():
     s = torch.linspace(0, 1, 300, dtype=torch.float64)
     eased = s**3 * (10 - 15 * s + 6 * s**2)

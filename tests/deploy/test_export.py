@@ -153,6 +153,7 @@ def test_unfitted_systems_and_copies(assert_same_velocity):
         assert_same_velocity(torch.export.export(system, (y,)).module()(y), system, y, 1e-6)
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:torch", "ignore::torch.jit.TracerWarning")  # of any trace
 def test_traces_take_every_step(make_field, positions):
     """The point that is traced needs fewer steps of the root than others."""
     ds = make_field(2, n_layers=5)

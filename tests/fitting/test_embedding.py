@@ -17,6 +17,7 @@ from latentds.fitting.embedding import (
     map_to_endpoints,
     straight_column,
 )
+from tests.motions import pause, rest_at_both_ends
 
 
 def laplacian(n_points, copies):
@@ -171,3 +172,33 @@ def test_a_rest_at_the_goal_takes_no_time(rest, moving):
     _, way, times = arc_length_path(np.stack([line, 3 - line], 1), clock, 5)
     np.testing.assert_allclose(way, np.linspace(1, 0, moving), atol=1e-12)
     assert times.tolist() == clock[:moving].tolist()
+
+
+def test_points_are_even_and_times_fit():
+    t = np.linspace(0, 1, 500)
+    positions = np.stack([np.cos(2 * t**3), np.sin(2 * t**3)], 1)  # uneven: almost all points lie at the start
+    path, way, times = arc_length_path(positions, 3 * t, 100)
+    gaps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    assert np.ptp(gaps) < 0.01 * gaps.mean()
+    assert np.array_equal(path[[0, -1]], positions[[0, -1]])
+    assert (np.diff(way) < 0).all()
+    assert (np.diff(times) > 0).all()
+    assert way[[0, -1]].tolist() == [1, 0]
+    np.testing.assert_allclose(way, 1 - (times / 3) ** 3, atol=3e-3)
+
+
+def test_jitter_at_rest_adds_no_path():
+    way = pause(np.linspace(0, 1, 3000))
+    clean = np.stack([way, way**2], 1)
+    noisy = clean + 5e-4 * np.random.default_rng(0).standard_normal(clean.shape)
+    raw, length = (np.linalg.norm(np.diff(p, axis=0), axis=1).sum() for p in (noisy, clean))
+    path = arc_length_path(noisy, np.arange(3000.0), 400)[0]
+    assert raw > 2 * length
+    assert np.linalg.norm(np.diff(path, axis=0), axis=1).sum() == pytest.approx(length, rel=0.03)
+
+
+def test_rest_at_the_goal_is_cut_and_at_the_start_kept():
+    way = rest_at_both_ends(np.linspace(0, 1, 401))
+    _, _, times = arc_length_path(np.stack([way, way**2], 1), np.linspace(0, 4, 401), 100)
+    assert times[-1] == pytest.approx(3.0, abs=0.03)
+    assert times[1] == pytest.approx(1.0, abs=0.03)

@@ -67,7 +67,7 @@ def bounded(x, c, v, limit, y):
 @pytest.mark.parametrize(
     ("beta", "mu"), [(0.5, 0.9), *(pytest.param(*both, marks=pytest.mark.slow) for both in ((0.9, 0.6), (1.0, 0.99)))]
 )
-@pytest.mark.parametrize(("x", "y"), cases())
+@pytest.mark.parametrize(("x", "y"), list(cases()))
 def test_every_layer_is_the_best_greedy_one(x, y, beta, mu):
     """Replayed by a plain loop: the centre is the worst point, it moves by β of its error, and no ρ is better."""
     layers = match(x, y, 20, beta, mu)

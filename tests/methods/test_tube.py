@@ -1,56 +1,18 @@
-"""TubeDS and its parts: demonstrated time law, tube dynamics, arc-length path; motions that are hard to learn from."""
+"""TubeDS: motions that are hard to learn from, several at once, far starts, units, depth and its report."""
 
 from __future__ import annotations
 
-import contextlib
-import itertools
 import math
-import re
-import time
-import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from scipy.integrate import solve_ivp
 
-from latentds import Demonstration, FitWarning, datasets
-from latentds.dynamics import Frame, TubeDynamics
-from latentds.fitting import search
-from latentds.fitting.embedding import arc_length_path
-from latentds.fitting.search import _what_hides
-from latentds.methods import tube
+from latentds import Demonstration, datasets
 from latentds.methods.tube import TubeDS, mean_motion
 from latentds.metrics import dtw
 from latentds.testing import wavy_motion
-from latentds.time_law import PiecewiseLinearLaw
-
-
-def tensor(values):
-    return torch.as_tensor(values, dtype=torch.float64)
-
-
-def motion(clock, *, dt=0.01, count=400):
-    """A bent plane curve travelled by a clock: share of the time -> share of the way."""
-    way = clock(np.linspace(0, 1, count))
-    return Demonstration(tensor(np.stack([1 - way, 0.3 * np.sin(4 * way)], 1)), dt)
-
-
-def rest_first(t):
-    return np.clip((t - 0.3) / 0.7, 0, 1)
-
-
-def pause(t):
-    return np.interp(t, [0, 0.35, 0.6, 1], [0, 0.5, 0.5, 1])
-
-
-def rest_at_both_ends(t):
-    return np.interp(t, [0, 0.25, 0.75, 1], [0, 0, 1, 1])
-
-
-def creep_then_dash(t):
-    return t**5
+from tests.motions import creep_then_dash, motion, pause, planar_spiral, rest_at_both_ends, rest_first, tensor
 
 
 def fast(dim, **settings):
@@ -60,114 +22,6 @@ def fast(dim, **settings):
 def rolled(ds, shown, start=None):
     with torch.no_grad():
         return ds.rollout(shown.start if start is None else start, shown.times)
-
-
-# --- the demonstrated time law ----------------------------------------------------------------------------------------
-
-TIMINGS = {
-    "even": (np.linspace(1, 0, 200), np.linspace(0, 2, 200)),
-    "slow start": (1 - np.linspace(0, 1, 200) ** 3, np.linspace(0, 2, 200)),
-    "pause": (np.array([1, 0.8, 0.6, 0.59, 0.3, 0.0]), np.array([0, 0.2, 0.4, 1.9, 2.2, 2.5])),
-    "rest at the start": (np.array([1, 0.999, 0.5, 0.0]), np.array([0, 3.0, 3.5, 4.0])),
-    "two points": (np.array([1.0, 0.0]), np.array([0.0, 0.7])),
-    "milliseconds": (np.linspace(1, 0, 200), np.linspace(0, 2e-3, 200)),
-}
-
-
-@pytest.mark.parametrize(("progress", "times"), TIMINGS.values(), ids=TIMINGS.keys())
-def test_a_law_takes_the_demonstrated_time(progress, times):
-    law = PiecewiseLinearLaw.from_timing(tensor(progress), tensor(times))
-    left = law.time_to_go(torch.ones(1, dtype=torch.float64))
-    s = law.progress_at(left - tensor(times))
-    # a tail of 1e-3 is all that is missing at the end
-    assert np.abs(s.numpy() - progress).max() < 0.02
-    spent = (left - law.time_to_go(tensor(np.maximum(progress, 2e-3)))).numpy()
-    assert np.abs(spent - times)[:-1].max() < 0.01 * times[-1]
-
-
-def test_above_the_start_the_speed_becomes_the_mean():
-    """What starts behind a rest is not held up by it."""
-    progress, times = TIMINGS["rest at the start"]
-    law = PiecewiseLinearLaw.from_timing(tensor(progress), tensor(times))
-    speed = law.speed(tensor([1.0, 1.02, 1.5, 10.0]))
-    assert speed[0] < 0.1 * 0.25
-    torch.testing.assert_close(speed[1:], torch.full((3,), 0.25, dtype=torch.float64))
-
-
-# --- tube dynamics ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("dim", [1, 2, 7])
-def test_flow_agrees_with_solve_ivp(dim, draw):
-    along = PiecewiseLinearLaw(tensor([0.01, 0.4, 1.0]), tensor([0.3, 2.0, 0.7]))
-    dynamics = TubeDynamics(along, PiecewiseLinearLaw(tensor([0.2]), tensor([1.5])))
-    start, goal = torch.randn(2, dim, generator=draw, dtype=torch.float64)
-    frame = Frame.between(start, goal)
-    x = torch.cat([start[None], goal + 3 * torch.randn(5, dim, generator=draw, dtype=torch.float64)])
-    times = torch.linspace(0, 1.5, 6, dtype=torch.float64)
-    path = dynamics.flow(x, times, frame)
-    solved = solve_ivp(
-        lambda _, flat: dynamics(tensor(flat).view(x.shape), x, frame).reshape(-1).numpy(),
-        (0, 1.5), x.numpy().ravel(), "LSODA", times.numpy(), rtol=1e-10, atol=1e-12,
-    )  # fmt: skip
-    assert np.abs(solved.y.T.reshape(6, *x.shape).swapaxes(0, 1) - path.numpy()).max() < 1e-7
-    assert (dynamics.lyapunov(path, frame).diff(dim=-1) < 0).all()
-    assert (dynamics(goal, goal, frame) == 0).all()
-    torch.testing.assert_close(dynamics.flow(goal, times, frame), goal.expand(6, dim), rtol=0, atol=0)
-
-
-def test_progress_falls_by_the_law_from_wherever_it_starts(draw):
-    law = PiecewiseLinearLaw(tensor([0.01, 0.4, 1.0]), tensor([0.3, 2.0, 0.7]))
-    dynamics = TubeDynamics(law, PiecewiseLinearLaw(tensor([0.2]), tensor([1.5])))
-    start, goal, aside = torch.randn(3, 3, generator=draw, dtype=torch.float64)
-    frame = Frame.between(start, goal)
-    middle = (start + goal) / 2
-    torch.testing.assert_close(dynamics.phase(torch.stack([start, goal, middle]), frame), tensor([1, 0, 0.5]))
-    path = dynamics.flow(goal + (start - goal) * 0.9 + 0.1 * aside, tensor([0.0, 0.1]), frame)
-    s = dynamics.phase(path, frame)
-    torch.testing.assert_close(law.time_to_go(s[0]) - law.time_to_go(s[1]), tensor(0.1))
-
-
-def test_offset_shrinks_at_the_rate_and_no_faster_than_the_cap():
-    dynamics = TubeDynamics(PiecewiseLinearLaw.uniform(), PiecewiseLinearLaw(tensor([0.25]), tensor([0.25 * 8])))
-    frame = Frame.between(tensor([2.0, 0.0]), tensor([0.0, 0.0]))
-    near = dynamics.flow(tensor([1.0, 0.4]), tensor([0.0, 0.1]), frame)[:, 1]
-    torch.testing.assert_close(near[1] / near[0], tensor(math.exp(-0.8)))
-    offsets = tensor([[1.0, 0.5], [1.0, 5.0], [1.0, 500.0]])
-    torch.testing.assert_close(dynamics(offsets, offsets, frame)[:, 1], tensor([-4.0, -4.0, -4.0]))
-
-
-# --- the path evenly spaced in arc length -----------------------------------------------------------------------------
-
-
-def test_points_are_even_and_times_fit():
-    t = np.linspace(0, 1, 500)
-    positions = np.stack([np.cos(2 * t**3), np.sin(2 * t**3)], 1)  # uneven: almost all points lie at the start
-    path, way, times = arc_length_path(positions, 3 * t, 100)
-    gaps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    assert np.ptp(gaps) < 0.01 * gaps.mean()
-    assert np.array_equal(path[[0, -1]], positions[[0, -1]])
-    assert (np.diff(way) < 0).all()
-    assert (np.diff(times) > 0).all()
-    assert way[[0, -1]].tolist() == [1, 0]
-    np.testing.assert_allclose(way, 1 - (times / 3) ** 3, atol=3e-3)
-
-
-def test_jitter_at_rest_adds_no_path():
-    way = pause(np.linspace(0, 1, 3000))
-    clean = np.stack([way, way**2], 1)
-    noisy = clean + 5e-4 * np.random.default_rng(0).standard_normal(clean.shape)
-    raw, length = (np.linalg.norm(np.diff(p, axis=0), axis=1).sum() for p in (noisy, clean))
-    path = arc_length_path(noisy, np.arange(3000.0), 400)[0]
-    assert raw > 2 * length
-    assert np.linalg.norm(np.diff(path, axis=0), axis=1).sum() == pytest.approx(length, rel=0.03)
-
-
-def test_rest_at_the_goal_is_cut_and_at_the_start_kept():
-    way = rest_at_both_ends(np.linspace(0, 1, 401))
-    _, _, times = arc_length_path(np.stack([way, way**2], 1), np.linspace(0, 4, 401), 100)
-    assert times[-1] == pytest.approx(3.0, abs=0.03)
-    assert times[1] == pytest.approx(1.0, abs=0.03)
 
 
 # --- hard demonstrations ----------------------------------------------------------------------------------------------
@@ -326,15 +180,24 @@ def family(count=5, *, end_apart=0.0, power=1):
     return found
 
 
-def test_several_are_followed_better_than_one():
+@pytest.fixture(scope="module")
+def together():
+    return fast(2).fit(family())
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return fast(2).fit(family()[0])
+
+
+def test_several_are_followed_better_than_one(together, alone):
     shown = family()
-    together, alone = fast(2).fit(shown), fast(2).fit(shown[0])
     scores = np.array([[dtw(rolled(ds, d), d.positions) / len(d) for d in shown[1:]] for ds in (together, alone)])
     assert scores[0].mean() < 0.7 * scores[1].mean()
 
 
 def test_several_agree_on_a_goal_and_report_their_spread():
-    shown = family(end_apart=0.02)
+    shown = family(3, end_apart=0.02)
     ds = fast(2).fit(shown)
     goals = torch.stack([d.goal for d in shown])
     torch.testing.assert_close(ds.attractor, goals.mean(0))
@@ -372,8 +235,8 @@ def test_the_mean_does_not_smear_a_corner_that_all_took_at_another_time():
 @pytest.mark.slow
 def test_several_make_the_map_near_isometric_across_the_path():
     """Points at a distance from the path encode to that distance from the axis, in the scale of the axis."""
-    shown = family()
-    ds = TubeDS(2, n_layers=150).fit(shown)
+    shown = family(3)
+    ds = TubeDS(2, n_layers=80).fit(shown)
     mean = mean_motion(shown)[0]
     path, tangents = mean.positions[30:-30:10], torch.nn.functional.normalize(mean.velocities[30:-30:10], dim=-1)
     across = torch.stack([-tangents[:, 1], tangents[:, 0]], dim=1)
@@ -388,19 +251,17 @@ def test_several_make_the_map_near_isometric_across_the_path():
         assert ratio.max() < 1.33
 
 
-def test_the_contraction_is_read_unless_it_is_asked_for():
-    shown = family()
-    read, asked = fast(2).fit(shown), TubeDS(2, refined=False, contraction=9.0).fit(shown)
-    assert 1 <= read.fit_report.contraction < 9
+def test_the_contraction_is_read_unless_it_is_asked_for(together, alone):
+    asked = fast(2, contraction=9.0).fit(family(2))
+    assert 1 <= together.fit_report.contraction < 9
     assert asked.fit_report.contraction == 9
-    assert read.contraction is None
-    assert fast(2).fit(shown[0]).fit_report.contraction == 20
-    assert fast(2).fit(family(power=12)).fit_report.contraction > read.fit_report.contraction
+    assert together.contraction is None
+    assert alone.fit_report.contraction == 20
+    assert fast(2).fit(family(power=12)).fit_report.contraction > together.fit_report.contraction
 
 
-def test_each_of_several_keeps_its_own_time():
-    shown = family()
-    ds = fast(2).fit(shown)
+def test_each_of_several_keeps_its_own_time(together):
+    shown, ds = family(), together
     with torch.no_grad():
         left = ds.dynamics.law.time_to_go(
             ds.dynamics.phase(ds.encode(torch.stack([d.start for d in shown])), ds.frame())
@@ -498,12 +359,6 @@ def test_refinement_pays():
 # --- the depth that follows from the motion ---------------------------------------------------------------------------
 
 
-def planar_spiral(turns, count=600):
-    way = np.linspace(1, 0.05, count)
-    angle = 2 * np.pi * turns * way
-    return Demonstration(way[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1), 0.01)
-
-
 def follows(ds, shown):
     return dtw(rolled(ds, shown), shown.positions) / len(shown) < 0.005 * shown.size
 
@@ -536,69 +391,3 @@ def test_an_easy_motion_takes_300_layers_and_what_is_asked_for_is_kept(tmp_path)
     fresh.load_state_dict(chosen.state_dict())
     assert torch.equal(rolled(fresh, shown), rolled(chosen, shown))
     assert TubeDS(2, n_layers=20, refined=False).fit(shown).diffeomorphism.n_layers == 20
-
-
-def wave(count=400):
-    """A path in space, (N, 3), of size 2."""
-    t = np.linspace(0, 1, count)
-    return np.stack([2 * t, 0.4 * np.sin(6 * np.pi * t), 0.2 * np.cos(5 * t)], 1)
-
-
-def noisy(path, share):
-    return path + share * 2 * np.random.default_rng(0).standard_normal(path.shape)
-
-
-def in_steps(path, share):
-    return share * 2 * np.round(path / (share * 2))
-
-
-@pytest.mark.parametrize(
-    ("spoil", "told"),
-    [(noisy, "noise of ([0-9.]+) of its size hides"), (in_steps, "recorded in steps of ([0-9.]+) of")],
-)
-def test_what_hides_the_motion_is_told_with_its_size(spoil, told):
-    for share in (0.03, 0.05):
-        shown = Demonstration(spoil(wave(), share), 0.01)
-        # The noise of a point is the median length of three coordinates' noise; a step is one coordinate's.
-        expected = share * 2 / shown.size * (1.54 if spoil is noisy else 1)
-        assert float(re.match(told, _what_hides(shown, 0.02))[1]) == pytest.approx(expected, rel=0.1)
-    assert _what_hides(Demonstration(spoil(wave(), 0.005), 0.01), 0.02) == ""
-    assert _what_hides(Demonstration(wave(), 0.01), 0.02) == _what_hides(Demonstration(wave(9), 0.01), 0.02) == ""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("spoil", [noisy, in_steps])
-def test_a_fit_to_a_blurred_recording_says_so_and_searches_no_deeper(spoil, monkeypatch):
-    monkeypatch.setattr(search.Search, "_deeper", None)
-    shown = Demonstration(spoil(wave(), 0.05), 0.01)
-    with pytest.warns(FitWarning) if spoil is noisy else contextlib.nullcontext():
-        ds = TubeDS(3, refined=False).fit(shown)
-    assert ds.fit_report.notes[0] == _what_hides(shown, 0.02) != ""
-    assert ds.fit_report.n_layers <= search.PLAN.n_layers
-
-
-def test_a_search_that_has_laid_its_layers_says_so(monkeypatch):
-    monkeypatch.setattr(tube, "PLAN", replace(search.PLAN, layer_budget=1))
-    with pytest.warns(FitWarning):
-        notes = TubeDS(2, refined=False).fit(planar_spiral(1.5)).fit_report.notes
-    assert notes[0].startswith("no match tried follows the path closely; its strands come within ")
-    assert notes[1] == "the search for a match stopped after 1000 layers"
-
-
-def test_neither_a_clock_nor_threads_change_a_fit(monkeypatch):
-    """A motion that is searched deeper for: every clock leaps by an hour at each look, and two threads may be used."""
-    shown, leaps, threads = planar_spiral(1.5, 300), itertools.count(step=3600.0), torch.get_num_threads()
-    monkeypatch.setattr(tube, "PLAN", replace(search.PLAN, layer_budget=4000))
-    states = []
-    try:
-        for count in (1, 2):
-            torch.set_num_threads(count)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", FitWarning)
-                states.append(TubeDS(2, refined=False).fit(shown).state_dict())
-            for name in ("time", "perf_counter", "monotonic", "process_time", "thread_time"):
-                monkeypatch.setattr(time, name, lambda: next(leaps))
-    finally:
-        torch.set_num_threads(threads)
-    assert states[0].keys() == states[1].keys()
-    assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())

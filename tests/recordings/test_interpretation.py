@@ -1,0 +1,166 @@
+"""Which columns are what: taken for what was meant, or asked about with the argument that settles it."""
+
+from __future__ import annotations
+
+import logging
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from latentds import Demonstration
+from tests.recordings.tables import DT, JOINTS, READ, T1, TAU, XYZ, N, Q, T, V, archive, as_json, lists, text
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "columns"),
+    [
+        ("header", "comma", ("x", "y", "z")),
+        ("no header", "no header", ()),
+        ("left out", "velocities and efforts", ("q1", "q2", "q3")),
+        ("names beside", "lists in cells", tuple(JOINTS)),
+        ("one row per joint", "one row per joint", tuple(JOINTS)),
+        ("trajectory", "JSON, ROS trajectory", tuple(JOINTS)),
+        ("an array", "npz", ()),
+    ],
+)
+def test_keeps_the_names_through_files_pickles_and_copies(name, kind, columns, tmp_path):
+    file, write = READ[kind]
+    write(tmp_path / file)
+    shown = Demonstration.load(tmp_path / file, name=name)
+    assert shown.columns == columns
+    shown.save(tmp_path / "saved.npz")
+    for back in (Demonstration.load(tmp_path / "saved.npz"), pickle.loads(pickle.dumps(shown)), replace(shown)):
+        assert (back.columns, back.name) == (columns, name)
+        np.testing.assert_array_equal(back.positions, shown.positions)
+
+
+@pytest.mark.parametrize("dt", [1e-9, 1.0, 1e6])
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+def test_its_own_files_are_read_whatever_their_time(dt, suffix, tmp_path):
+    shown = Demonstration(Q, dt)
+    shown.save(tmp_path / f"a{suffix}")
+    back = Demonstration.load(tmp_path / f"a{suffix}")
+    assert back.dt == pytest.approx(dt)
+    assert back.columns == ()
+    np.testing.assert_allclose(back.positions, Q, atol=1e-14)
+
+
+def test_says_what_was_understood(tmp_path, caplog):
+    READ["velocities and efforts"][1](tmp_path / "a.csv")
+    with caplog.at_level(logging.INFO, logger="latentds"):
+        shown = Demonstration.load(tmp_path / "a.csv")
+    assert caplog.messages == [shown.origin]
+    assert shown.origin == (
+        "a.csv: 60 rows; time 't' in s, the unit that makes sense: 1.18 s; positions q1, q2, q3; "
+        "left out dq1, dq2, dq3 (velocity), tau_1, tau_2, tau_3 (effort)"
+    )
+
+
+RAMP = np.linspace(1, 3, N)
+REFUSED = {
+    "no time": ("a.csv", text("x,y,z", Q), "dt: .*a.csv holds x 60, y 60, z 60"),
+    "no time, npy": ("a.npy", lambda p: np.save(p, Q), "dt: .*pass dt="),
+    "rows numbered instead": ("a.csv", text("", [str(i) for i in range(N)], Q), "unit: .*row number"),
+    "time or rows": ("a.csv", text(XYZ, [str(i) for i in range(N)], Q), "unit: .*row number"),
+    "two units make sense": ("a.csv", text(XYZ, (0.5 + np.arange(N) * 10)[:, None] / 5, Q), "unit: .*s or ms"),
+    "a minute a row": ("a.csv", text("time_s,x,y,z", 60e3 * T1, Q), "unit: .* in s"),
+    "seconds called milliseconds": ("a.csv", text("t_ms,x,y,z", T1, Q), "unit: .* in ms"),
+    "dt of an hour": ("a.npz", archive(q=Q, dt=3600.0), "dt: .*got 3600 from 'dt'"),
+    "two clocks": ("a.csv", text("sim_time,wall_time,x,y,z", T1, 1.5 * T1, Q), "time: .*'sim_time', 'wall_time'"),
+    "clock and dt differ": ("a.npz", archive(q=Q, t=T, dt=0.5), "time: .*0.02 .* 0.5 by 'dt'"),
+    "two that rise evenly": ("a.csv", text("", T1, RAMP[:, None], Q), "time: .*0, 1.*pass dt="),
+    "time twice the same": ("a.csv", text(XYZ, np.repeat(T[::2], 2)[:, None], Q), "times: .*'t'.* pass time= or dt="),
+    "time with a gap": ("a.csv", text(XYZ, ["0.0", "", *map(str, T[2:])], Q), "time: .*row 1"),
+    "joints and hand": ("a.csv", text("t,q1,q2,q3,x,y,z", T1, Q, Q + 1), "columns: .*pass columns="),
+    "two arms": ("a.npz", archive(left=Q, right=Q, t=T), "columns: .*left 60×3, right 60×3"),
+    "several motions": ("a.npz", archive(q_0=Q, q_1=Q[5:], dt=DT), "columns: .*q_0 60×3, q_1 55×3"),
+    "raw and filtered": ("a.csv", text("t,raw_x,raw_y,filtered_x,filtered_y", T1, Q[:, :2], Q[:, :2]),
+                         "columns: .*'x'"),
+    "names twice": ("a.csv", text("t,x,y,x,y", T1, Q[:, :2], Q[:, :2]), "columns: .*several"),
+    "velocities without names": ("a.csv", text("", T1, Q, V), "columns: .*velocities of 1, 2, 3"),
+    "and efforts": ("a.npy", lambda p: np.save(p, np.column_stack([T, Q, V, TAU])), "columns: .*velocities of 1, 2, 3"),
+    "velocities alone": ("a.csv", text("t,dq1,dq2,dq3", T1, V), "columns: "),
+    "(n, N)": ("a.npy", lambda p: np.save(p, Q.T), "dt: |columns: .*transposed"),
+    "1000 columns": ("a.npz", archive(data=np.tile(Q, (20, 400)), dt=DT), "columns: .*at most 200"),
+    "three axes": ("a.npz", archive(q=np.stack([Q, Q]), dt=DT), "columns: .*q 2×60×3"),
+    "a lost marker": ("a.csv", lambda p: p.write_text("t,x\n0,1\n0.1,\n0.2,3\n"), "positions: .*NaN.* row 1"),
+    "names that change": ("a.csv", text("t;name;position", T1, ["['a', 'b', 'c']"] * (N - 1) + ["['b', 'a', 'c']"],
+                                        lists(Q), sep=";"), "columns: .*'name'"),
+    "empty JSON": ("a.json", as_json({}), "columns: .*holds nothing"),
+}  # fmt: skip
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("kind", REFUSED)
+def test_asks_about_what_is_ambiguous(kind, tmp_path):
+    name, write, message = REFUSED[kind]
+    write(tmp_path / name)
+    with pytest.raises(ValueError, match=f"^({message})"):
+        Demonstration.load(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("kind", "answer"),
+    [
+        ("no time", {"dt": DT}),
+        ("no time, npy", {"dt": DT}),
+        ("rows numbered instead", {"dt": DT}),
+        ("time or rows", {"dt": DT}),
+        ("two units make sense", {"dt": DT}),
+        ("seconds called milliseconds", {"unit": "s"}),
+        ("a minute a row", {"unit": "s", "duration": 60e3 * T[-1]}),
+        ("dt of an hour", {"dt": DT}),
+        ("two clocks", {"time": "sim_time"}),
+        ("two clocks", {"time": 1, "duration": 1.5 * T[-1]}),
+        ("clock and dt differ", {"time": "t"}),
+        ("two that rise evenly", {"time": 0, "columns": [2, 3, 4]}),
+        ("joints and hand", {"columns": ["q1", "q2", "q3"]}),
+        ("two arms", {"columns": "left"}),
+        ("several motions", {"columns": "q_0"}),
+        ("raw and filtered", {"columns": ["raw_x", "raw_y"], "of": [0, 1]}),
+        ("names twice", {"columns": (1, 2), "of": [0, 1]}),
+        ("velocities without names", {"columns": range(1, 4)}),
+        ("and efforts", {"columns": range(1, 4), "time": 0}),
+        ("velocities alone", {"columns": ["dq2"], "wanted": V[:, [1]]}),
+    ],
+)
+def test_an_answer_settles_it(kind, answer, tmp_path):
+    name, write, _ = REFUSED[kind]
+    write(tmp_path / name)
+    wanted = answer.pop("wanted", Q[:, answer.pop("of", [0, 1, 2])])
+    duration = answer.pop("duration", T[-1])
+    shown = Demonstration.load(tmp_path / name, **answer)
+    np.testing.assert_allclose(shown.positions, wanted, atol=2e-5)
+    assert shown.duration == pytest.approx(duration, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"columns": "foo"}, "columns: .*got 'foo'.*holds t 60, x 60"),
+        ({"columns": 9}, "columns: .*got 9"),
+        ({"columns": []}, "columns: .*got none"),
+        ({"columns": [None]}, "columns: .*got None"),
+        ({"time": "foo"}, "time: .*got 'foo'"),
+        ({"unit": "h"}, "unit: expected one of s, ms, us, ns, got 'h'"),
+        ({"unit": 3}, "unit: expected one of s, ms, us, ns, got 3"),
+        ({"dt": 0}, "dt: expected a finite number > 0"),
+        ({"dt": 1, "unit": "s"}, "dt: expected either"),
+        ({"dt": 1, "time": "t"}, "dt: expected either"),
+        ({"name": 3}, "name: expected a string"),
+    ],
+)
+def test_refuses_arguments(asked, message, tmp_path):
+    READ["comma"][1](tmp_path / "a.csv")
+    with pytest.raises(ValueError, match=message):
+        Demonstration.load(tmp_path / "a.csv", **asked)
+
+
+def test_uneven_stamps_are_resampled(tmp_path):
+    uneven = T + 0.004 * np.sin(40 * T)
+    text(XYZ, uneven[:, None], Q)(tmp_path / "a.csv")
+    shown = Demonstration.load(tmp_path / "a.csv")
+    wanted = Demonstration.from_times(uneven, Q)
+    np.testing.assert_allclose(shown.positions, wanted.positions, atol=1e-6)
