@@ -21,18 +21,16 @@ from typing import Any, TypeVar
 
 import numpy as np
 import onnxruntime
-import pandas as pd
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from experiments import goals
-from experiments.goals import Goal
+from experiments import report
+from experiments.report import Goal, at_most
 from latentds import Demonstration, LatentDS, TubeDS, datasets
+from latentds.arguments import Array
 from latentds.deploy import c, onnx
 from latentds.testing import wavy_motion
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 LIMITS = {torch.float64: 1e-12, torch.float32: 1e-5}
@@ -85,11 +83,11 @@ def within(what: str, found: Any, ds: LatentDS, y: Tensor, bound: float) -> Goal
     """That velocities differ from eager torch by no more than ``bound``, in largest speeds."""
     expected = ds(y).double()
     error = (torch.as_tensor(found).double() - expected).abs().max() / torch.linalg.vector_norm(expected, dim=-1).max()
-    return goals.at_most(f"{what}, distance from eager", pd.Series([float(error)]), bound)._replace(unit="top speed")
+    return at_most(f"{what}, distance from eager", float(error), bound)._replace(unit="top speed")
 
 
 def seconds(what: str, taken: float, bound: float, note: str = "") -> Goal:
-    return goals.at_most(what, pd.Series([taken]), bound)._replace(unit="s", note=note)
+    return at_most(what, taken, bound)._replace(unit="s", note=note)
 
 
 def take_turns(compiled: Callable[[Tensor], Tensor], ds: LatentDS, y: Tensor) -> str:
@@ -145,7 +143,7 @@ def in_onnx(calls: int) -> list[Goal]:
             (velocity,) = session.run(None, {"y": points})
             micro = [1e6 * timed(lambda: session.run(None, {"y": points[:1]}))[1] for _ in range(calls)]  # noqa: B023
             note = f"one point takes onnxruntime {np.median(micro):.0f} µs, worst of {calls}: {max(micro):.0f} µs"
-            kilobytes = goals.at_most(f"{label}, file", pd.Series([path.stat().st_size / 1000]), 100)
+            kilobytes = at_most(f"{label}, file", path.stat().st_size / 1000, 100)
             found += [
                 seconds(f"{label}, written", taken, 10, note),
                 kilobytes._replace(unit="kB"),
@@ -208,5 +206,5 @@ def measure(quick: bool) -> list[Goal]:
 if __name__ == "__main__":
     torch.set_num_threads(1)
     torch.set_grad_enabled(False)
-    print(goals.table(measure(quick=False)), flush=True)
+    print(report.goal_table(measure(quick=False)), flush=True)
     print(f"\nLoad average at the end: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores.")

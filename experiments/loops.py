@@ -6,14 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from latentds import ChebyshevDS
+from latentds.arguments import Array
 from latentds.diffeomorphism import WIDTH_BOUND
-
-Array = NDArray[np.float64]
 
 Loop = list[tuple[Tensor, Tensor, Tensor]]
 """(c, v, ρ) of every layer."""

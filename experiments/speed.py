@@ -5,7 +5,7 @@
 Rivals take turns, and what counts are ratios of medians, in CPU time of the one thread that computes: other processes
 then slow both through shared caches only, where in wall time they would interrupt the longer call more often than the
 shorter one. A control loop's latency is wall time, interruptions included, so run this on an otherwise idle machine.
-Leaves goals.csv, growth.csv, summary.md, growth.png and environment.json in ``--out``.
+Leaves report.csv, growth.csv, summary.md, growth.png and environment.json in ``--out``.
 """
 
 from __future__ import annotations
@@ -23,22 +23,21 @@ import numpy as np
 import pandas as pd
 import torch
 import typer
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.markdown import Markdown
 from scipy.integrate import solve_ivp
 from torch import Tensor, nn
 
 from baselines import SDSEF
-from experiments import deployed, figures, goals, loops, report
-from experiments.goals import Goal
+from experiments import deployed, loops, report
+from experiments.report import Goal, at_most
 from latentds import ChebyshevDS, TubeDS, datasets, kernels
+from latentds.arguments import Array
 from latentds.fitting.matching import match
 from latentds.kernels.compiling import OPTIONS
 from latentds.kernels.dispatch import BLOCK, reference
 from latentds.kernels.lanes import WIDTH, exp, load, store
-
-Array = NDArray[np.float64]
 
 N_LAYERS = 150
 SHOWN = datasets.unstable_spiral(7)
@@ -95,7 +94,7 @@ def take_turns(rivals: Mapping[str, Callable[[], Any]], rounds: int, share: floa
 def race(what: str, least: float, slow: Callable[[], Any], fast: Callable[[], Any], rounds: int) -> Goal:
     """That ``fast`` is ``least`` times faster than ``slow``."""
     times = take_turns({"slow": slow, "fast": fast}, rounds)
-    return goals.ratio(what, least, times["slow"], times["fast"])
+    return report.ratio(what, least, times["slow"], times["fast"])
 
 
 # --- studies ----------------------------------------------------------------------------------------------------------
@@ -132,7 +131,7 @@ def against_floor(ds: ChebyshevDS, rounds: int) -> list[Goal]:
         f"{np.median(each_exp) * 1e9:.2f} ns, {operations(3)} operations of {np.median(each_product) * 1e9:.3f} ns"
     )
     return [
-        goals.median("decode 10⁵ points", "times the floor", 2.5, times["decode"] / floor, at_most=True, note=note),
+        report.median("decode 10⁵ points", "times the floor", 2.5, times["decode"] / floor, at_most=True, note=note),
         race(
             "decode 10⁵ points, torch loop", 35, partial(loops.forward, layers, x), partial(ds.decode, x), few(rounds)
         ),
@@ -170,10 +169,10 @@ def control_loop(calls: int) -> list[Goal]:
                 seconds[i] = clock() - began
         micro = wall * 1e6
         label = f"controller(y), M = {n_layers}"
-        found.append(goals.median(f"{label}, median", "µs", most, micro, at_most=True))
+        found.append(report.median(f"{label}, median", "µs", most, micro, at_most=True))
         late = float(np.quantile(micro, 0.99))
         note = f"worst of {calls}: {micro.max():.0f} µs; of CPU time {np.quantile(busy, 0.99) * 1e6:.0f} µs"
-        slow = goals.at_most(f"{label}, 99th percentile", pd.Series([late]), 1000)
+        slow = at_most(f"{label}, 99th percentile", late, 1000)
         found.append(slow._replace(unit="µs", note=note))
     return found
 
@@ -195,9 +194,9 @@ def rollouts(ds: ChebyshevDS, rounds: int) -> list[Goal]:
     seconds = np.array([time.thread_time() - began])
     coarse = float((slow() - found).abs().max())
     return [
-        goals.ratio("rollout 16 x 1000, RK4 on ds(y)", 60, clock["rk4"], clock["fast"]),
-        goals.ratio("rollout 16 x 1000, dopri5 on controller(y)", 60, seconds, clock["fast"]),
-        goals.at_most("rollout, distance from dopri5 (rtol 1e-9)", pd.Series([worst]), 1e-6)._replace(
+        report.ratio("rollout 16 x 1000, RK4 on ds(y)", 60, clock["rk4"], clock["fast"]),
+        report.ratio("rollout 16 x 1000, dopri5 on controller(y)", 60, seconds, clock["fast"]),
+        at_most("rollout, distance from dopri5 (rtol 1e-9)", worst, 1e-6)._replace(
             unit="units", note=f"RK4 of 1000 steps: {coarse:.1e}"
         ),
     ]
@@ -224,7 +223,7 @@ def gradients(rounds: int) -> list[Goal]:
         fast, slow = partial(gradient, loss), partial(by_torch, loss)
         apart = float((fast() - slow()).norm() / slow().norm())
         goal = race(f"gradient of the {name}, M = 300, N = 1000, torch path", 10, slow, fast, few(rounds))
-        found += [goal, goals.at_most("... relative difference", pd.Series([apart]), 1e-10)]
+        found += [goal, at_most("... relative difference", apart, 1e-10)]
     return found
 
 
@@ -238,9 +237,7 @@ def fits(rounds: int) -> list[Goal]:
     note = f"MSE {error:.3g} against {theirs:.3g}"
     return [
         race("fit, M = 300, N = 1000, bounded scalar search", 30, slow, fast, few(rounds)),
-        goals.at_most("fit, MSE over that of the bounded search", pd.Series([error / theirs]), 1)._replace(
-            unit="ratio", note=note
-        ),
+        at_most("fit, MSE over that of the bounded search", error / theirs, 1)._replace(unit="ratio", note=note),
     ]
 
 
@@ -315,6 +312,19 @@ def exponents(curves: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["grows", "call", "from", "to", "exponent"])
 
 
+def draw_growth(curves: pd.DataFrame) -> Figure:
+    """Seconds of each call over points N and layers M, on log scales; columns grows, call, size and seconds."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    for axis, (grows, label) in zip(figure.subplots(1, 2), (("N", "points N"), ("M", "layers M")), strict=True):
+        for call, curve in curves[curves["grows"] == grows].groupby("call"):
+            axis.loglog(curve["size"], curve["seconds"], "o-", label=call, markersize=3)
+        axis.set(xlabel=label, ylabel="seconds")
+        axis.xaxis.set_minor_formatter("")
+        axis.grid(alpha=0.3)
+        axis.legend(frameon=False)
+    return figure
+
+
 def main(
     quick: Annotated[bool, typer.Option(help="Fewer rounds, no million points, one export: some two minutes.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for tables, curves and the picture.")] = Path("results/speed"),
@@ -339,7 +349,7 @@ def main(
     summary = "\n\n".join(
         [
             f"Load average while it ran: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; 1 core is used.",
-            goals.table(found),
+            report.goal_table(found),
             report.table(
                 ("grows", "call", "from", "to", "exponent of the time"),
                 [(*map(str, row[:-1]), f"{row[-1]:.2f}") for row in exponents(curves).itertuples(index=False)],
@@ -347,13 +357,13 @@ def main(
         ]
     )
     out.mkdir(parents=True, exist_ok=True)
-    report.write(out / "goals.csv", pd.DataFrame(found).to_csv(index=False))
+    report.write(out / "report.csv", pd.DataFrame(found).to_csv(index=False))
     report.write(out / "growth.csv", curves.to_csv(index=False))
     report.write(out / "summary.md", summary + "\n")
     report.write(out / "environment.json", report.environment())
-    figures.growth(curves).savefig(out / "growth.png", dpi=150)
+    draw_growth(curves).savefig(out / "growth.png", dpi=150)
     console.print(Markdown(summary))
-    console.print(f"{out}: summary.md, goals.csv, growth.csv, growth.png, environment.json")
+    console.print(f"{out}: summary.md, report.csv, growth.csv, growth.png, environment.json")
 
 
 if __name__ == "__main__":

@@ -22,9 +22,8 @@ import typer
 from rich.console import Console
 from rich.markdown import Markdown
 
-from experiments import report, scores
-from experiments.methods import RIVALS, methods
-from experiments.motions import spirals
+from experiments import report
+from experiments.compared import RIVALS, methods, spirals
 from experiments.published import TABLE_ONE
 from latentds import Demonstration, plotting
 from latentds import report as page
@@ -154,7 +153,7 @@ def _by_seed(rows: pd.DataFrame, names: list[str]) -> str:
 def _p_values(first: pd.Series, second: pd.Series) -> str:
     if len(first) < 2 or len(first) != len(second) or not np.isfinite([*first, *second]).all():
         return "—"
-    return f"{scores.paired(first, second):.1e} / {scores.welch(first, second):.1e}"
+    return f"{report.paired(first, second):.1e} / {report.welch(first, second):.1e}"
 
 
 def _table_one(rows: pd.DataFrame, names: list[str]) -> str:

@@ -18,7 +18,7 @@ import typer
 from rich.console import Console
 
 from experiments import report
-from experiments.motions import recordings
+from experiments.compared import recordings
 from experiments.paper.document import Document
 from experiments.paper.plan import FULL, QUICK, Plan
 from experiments.paper.sections import STEPS

@@ -12,13 +12,13 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
-from experiments import motions, scores
-from experiments.methods import RIVALS, greedy
+from experiments import compared, report
+from experiments.compared import RIVALS, greedy
 from experiments.paper import tuning, variants
 from experiments.paper.held_out import held_out
 from experiments.paper.study import SDS_EF, Study, paths, rows
 from experiments.published import TABLE_ONE, TABLE_TWO, Size
-from experiments.scores import level, welch
+from experiments.report import mean_or_inf, welch
 from latentds import Demonstration, StableDS, datasets, metrics
 from latentds.benchmark import Cell, Outcome
 from latentds.fitting.tuning import choose
@@ -35,7 +35,7 @@ def table_one() -> pd.DataFrame:
     for name in TABLE_ONE["Chebyshev"]:
         for method in RIVALS:
             paper = TABLE_ONE[method][name]
-            ours = tuning.trace(method, motions.spiral(name), paper.beta, paper.mu, [paper.n_layers])[0]
+            ours = tuning.trace(method, compared.spiral(name), paper.beta, paper.mu, [paper.n_layers])[0]
             lines.append({"spiral": name, "method": method, "paper": paper, "ours": ours, "ratio": ours / paper.mse})
     return pd.DataFrame(lines)
 
@@ -93,10 +93,10 @@ def similarity(fast: Mapping[str, Mapping[str, Array]], exact: Mapping[str, Mapp
                 "spiral": name,
                 "fast": welch(*(of[method] for method in RIVALS)),
                 "exact": welch(*(exact[name][method] for method in RIVALS)),
-                "paired": scores.paired(*(exact[name][method] for method in RIVALS)),
-                "lower": min(RIVALS, key=lambda method, of=of: level(of[method])),  # type: ignore[misc]
-                "nearer": level(of["Chebyshev"]) < level(of["FDM"]),
-                "best": min(of, key=lambda method, of=of: level(of[method])),  # type: ignore[misc]
+                "paired": report.paired(*(exact[name][method] for method in RIVALS)),
+                "lower": min(RIVALS, key=lambda method, of=of: mean_or_inf(of[method])),  # type: ignore[misc]
+                "nearer": mean_or_inf(of["Chebyshev"]) < mean_or_inf(of["FDM"]),
+                "best": min(of, key=lambda method, of=of: mean_or_inf(of[method])),  # type: ignore[misc]
             }
             for name, of in fast.items()
         ]
@@ -119,7 +119,7 @@ def parameters(study: Study) -> pd.DataFrame:
 def planes(study: Study) -> tuple[pd.DataFrame, list[Demonstration], dict[str, dict[str, StableDS]]]:
     """Scores in sizes of the motion, and how far the paper's attractor is off; the motions drawn; what is fitted."""
     drawn = [datasets.archimedean_spiral(), *(datasets.drawn(name) for name in study.plan.strokes)]
-    written = motions.handwriting() if study.plan.lasa else {}
+    written = compared.handwriting() if study.plan.lasa else {}
     lines, fitted = [], {}
     for shown in [*drawn, *(written[shape][0] for shape in study.plan.lasa if written)]:
         chosen = {method: tuning.setting(study.choice(method, shown).least_beta) for method in RIVALS}
@@ -155,7 +155,7 @@ def joints(study: Study) -> tuple[pd.DataFrame, list[Demonstration], list[Outcom
 def sensitivity(study: Study) -> pd.DataFrame:
     """Scores of both rivals under each change; ``turned``: another is nearer than in the first line of its spiral."""
     names = study.plan.sensitive
-    settings = {name: {method: study.setting(method, motions.spiral(name)) for method in RIVALS} for name in names}
+    settings = {name: {method: study.setting(method, compared.spiral(name)) for method in RIVALS} for name in names}
     protocol = study.protocol()
     outcomes = study.run(variants.cells(settings), protocol)
     near = rows(outcomes).query("start > 0").groupby(["demonstration", "method"])
@@ -166,7 +166,7 @@ def sensitivity(study: Study) -> pd.DataFrame:
 
     for name in names:
         first = variants.CHANGES[0].name
-        reference = protocol.reference(motions.spiral(name))
+        reference = protocol.reference(compared.spiral(name))
         moved = paths(outcomes, name, [f"{method} | {first}" for method in RIVALS]).values()
         found = {
             f"{first}: exact DTW": of(name, first),
@@ -179,7 +179,7 @@ def sensitivity(study: Study) -> pd.DataFrame:
         for change in variants.CHANGES[1:]:
             if (name, f"{RIVALS[0]} | {change.name}") in near.groups:
                 found[change.name] = of(name, change.name)
-        nearer = [level(one) < level(other) for one, other in found.values()]
+        nearer = [mean_or_inf(one) < mean_or_inf(other) for one, other in found.values()]
         for (what, both), here in zip(found.items(), nearer, strict=True):
             line = {"spiral": name, "change": what, "nearer": RIVALS[not here], "p": welch(*both)}
             lines.append(line | {"turned": here != nearer[0]} | dict(zip(RIVALS, both, strict=True)))

@@ -11,13 +11,13 @@ import torch
 
 from baselines import DMP
 from baselines.dmp import FADING, STIFFNESS
-from experiments import motions
-from experiments.methods import RIVALS, greedy
+from experiments import compared
+from experiments.compared import RIVALS, greedy
 from experiments.paper import figures, latent_space, measurements, tuning, verdicts
 from experiments.paper.document import Document
 from experiments.paper.study import SDS_EF, Study, paths
 from experiments.published import TABLE_ONE, TABLE_THREE, Setting, Size
-from experiments.scores import mean_and_spread
+from experiments.report import mean_and_spread
 from latentds import TubeDS, datasets, plotting
 
 EVERY = (*RIVALS, *SDS_EF)
@@ -266,7 +266,7 @@ def table_two(study: Study, found: Document) -> None:
 
 def replications(study: Study, found: Document) -> None:
     for name in ("unstable c=7", "stable c=3"):
-        drawn = plotting.replications(motions.spiral(name), paths(study.outcomes, name, EVERY))
+        drawn = plotting.replications(compared.spiral(name), paths(study.outcomes, name, EVERY))
         caption = f"{name}: rollouts from the demonstrated and 20 other starts"
         found.show(name.replace(" ", "_").replace("=", ""), drawn, caption)
     found.find(verdicts.replications())

@@ -11,8 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from baselines import SDSEF
-from experiments.methods import RIVALS, greedy
-from experiments.motions import spiral
+from experiments.compared import RIVALS, greedy, spiral
 from experiments.paper import tuning
 from experiments.paper.held_out import held_out
 from experiments.paper.plan import Plan

@@ -15,7 +15,7 @@ import numpy as np
 import optuna
 from numpy.typing import NDArray
 
-from experiments.methods import GREEDY
+from experiments.compared import GREEDY
 from experiments.published import Setting
 from latentds import Demonstration
 from latentds.cache import fingerprint

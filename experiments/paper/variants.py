@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import torch
 
-from experiments.methods import greedy
-from experiments.motions import spiral
+from experiments.compared import greedy, spiral
 from experiments.published import Setting
 from latentds import Demonstration
 from latentds.base import LatentDS, Learned

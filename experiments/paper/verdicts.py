@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from experiments.methods import RIVALS
+from experiments.compared import RIVALS
 from experiments.paper import latent_space
 from experiments.paper.study import SDS_EF
 from experiments.published import TABLE_ONE, TABLE_THREE, TABLE_TWO

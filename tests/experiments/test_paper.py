@@ -8,7 +8,7 @@ import pytest
 import torch
 import typer
 
-from experiments.methods import GREEDY, RIVALS, greedy
+from experiments.compared import GREEDY, RIVALS, greedy
 from experiments.paper import figures, latent_space, tuning, verdicts
 from experiments.paper.__main__ import main, reproduce
 from experiments.paper.held_out import HeldOut

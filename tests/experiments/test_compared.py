@@ -7,30 +7,30 @@ import json
 import numpy as np
 import pytest
 
-from experiments import motions
+from experiments import compared
 from latentds import Demonstration, datasets
 from latentds.testing import wavy_motion
 
 
 def test_spirals_have_names_that_lead_back_to_them():
-    for shown in motions.spirals(quick=True):
-        assert (motions.spiral(shown.name).positions == shown.positions).all()
-    assert [d.name for d in motions.spirals(quick=False)] == [d.name for d in datasets.spiral_suite(3)]
+    for shown in compared.spirals(quick=True):
+        assert (compared.spiral(shown.name).positions == shown.positions).all()
+    assert [d.name for d in compared.spirals(quick=False)] == [d.name for d in datasets.spiral_suite(3)]
 
 
 def test_recordings_are_read_from_files_and_folders(tmp_path):
-    assert motions.recordings([]) == []
+    assert compared.recordings([]) == []
     for name, ending in (("two", "npz"), ("one", "csv")):
         shown = wavy_motion(2)
         Demonstration(shown.positions, shown.dt, name).save(tmp_path / f"{name}.{ending}")
-    assert [shown.name for shown in motions.recordings([tmp_path])] == ["one", "two"]
-    assert [shown.name for shown in motions.recordings([tmp_path / "two.npz"])] == ["two"]
+    assert [shown.name for shown in compared.recordings([tmp_path])] == ["one", "two"]
+    assert [shown.name for shown in compared.recordings([tmp_path / "two.npz"])] == ["two"]
     with pytest.raises(ValueError, match="data: expected recordings of different names"):
-        motions.recordings([tmp_path, tmp_path / "one.csv"])
+        compared.recordings([tmp_path, tmp_path / "one.csv"])
     with pytest.raises(ValueError, match=r"data: expected files of kind \.csv .*\.npz.*, found none in .*nothing"):
-        motions.recordings([tmp_path / "nothing"])
+        compared.recordings([tmp_path / "nothing"])
     with pytest.raises(FileNotFoundError):
-        motions.recordings([tmp_path / "nothing.npz"])
+        compared.recordings([tmp_path / "nothing.npz"])
 
 
 def test_recordings_of_every_kind_that_a_demonstration_is_read_from(tmp_path):
@@ -38,4 +38,4 @@ def test_recordings_of_every_kind_that_a_demonstration_is_read_from(tmp_path):
     (tmp_path / "one.JSON").write_text(json.dumps({"dt": shown.dt, "positions": shown.positions.tolist()}))
     (tmp_path / "read me.md").write_text("no recording")
     np.savetxt(tmp_path / "two.txt", np.column_stack([shown.times, shown.positions]), header="t [s] x y")
-    assert [found.positions.tolist() for found in motions.recordings([tmp_path])] == 2 * [shown.positions.tolist()]
+    assert [found.positions.tolist() for found in compared.recordings([tmp_path])] == 2 * [shown.positions.tolist()]
