@@ -343,9 +343,7 @@ def draw_gains(rows: pd.DataFrame, families: Sequence[str]) -> Figure:
             axes.barh(place + shift, means, 0.36, color=colour, label=name)
         axes.set(xscale="log", xlim=(5e-5, 1), title=family, xlabel="DTW/500 [sizes of the motion]")
         axes.set_yticks(place, labels)
-        axes.grid(axis="x", color="#DDDDDD", lw=0.6)
-        axes.set_axisbelow(True)
-        axes.spines[["top", "right"]].set_visible(False)
+        report.plain(axes, "x")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
     return figure
 
@@ -392,16 +390,13 @@ def main(
     out.mkdir(parents=True, exist_ok=True)
     tables: list[pd.DataFrame] = []
     shapes: dict[str, Any] = {}
-    try:
+    with report.interruptible(console):
         for part in parts(shown, recorded or stand_ins, written):
             console.print(f"{part.family}: {len(part.cells)} fits")
             paths: Paths = {}
             tables.append(results(part, jobs, out / "cells.sqlite", paths))
             if part.family == LASA:
                 shapes |= {c.demonstration: (c.judges, paths[c.name]) for c in part.cells if c.method == "TubeDS"}
-    except KeyboardInterrupt:
-        console.print("Interrupted; the same command goes on from here.")
-        raise typer.Exit(130) from None
     rows = pd.concat(tables, ignore_index=True)
     many = {d.name: joined_floor(d, MORE_STARTS, MORE_STARTS.starts(d)[1:].numpy()) for d in shown}
     best = {d.name: (sampling_floor(d, MORE_STARTS), float(np.mean(many[d.name]))) for d in shown}

@@ -83,11 +83,7 @@ def within(what: str, found: Any, ds: LatentDS, y: Tensor, bound: float) -> Goal
     """That velocities differ from eager torch by no more than ``bound``, in largest speeds."""
     expected = ds(y).double()
     error = (torch.as_tensor(found).double() - expected).abs().max() / torch.linalg.vector_norm(expected, dim=-1).max()
-    return at_most(f"{what}, distance from eager", float(error), bound)._replace(unit="top speed")
-
-
-def seconds(what: str, taken: float, bound: float, note: str = "") -> Goal:
-    return at_most(what, taken, bound)._replace(unit="s", note=note)
+    return at_most(f"{what}, distance from eager", float(error), bound, unit="top speed")
 
 
 def take_turns(compiled: Callable[[Tensor], Tensor], ds: LatentDS, y: Tensor) -> str:
@@ -120,9 +116,9 @@ def in_torch(dim: int, dtype: torch.dtype) -> list[Goal]:
     calls = take_turns(compiled, ds, y)
     note = f"{nodes} nodes, {size(small.graph_module)} at M = 2; a file of {file.getbuffer().nbytes / 1000:.0f} kB"
     return [
-        seconds(f"torch.export, {label}", exported, 30, note),
+        at_most(f"torch.export, {label}", exported, 30, unit="s", note=note),
         within(f"torch.export, {label}", program.module()(y), ds, y, LIMITS[dtype]),
-        seconds(f"torch.compile, {label}, first answer", first, 90, f"{busy}; then {calls}"),
+        at_most(f"torch.compile, {label}, first answer", first, 90, unit="s", note=f"{busy}; then {calls}"),
         within(f"torch.compile, {label}", found, ds, y, LIMITS[dtype]),
     ]
 
@@ -143,10 +139,9 @@ def in_onnx(calls: int) -> list[Goal]:
             (velocity,) = session.run(None, {"y": points})
             micro = [1e6 * timed(lambda: session.run(None, {"y": points[:1]}))[1] for _ in range(calls)]  # noqa: B023
             note = f"one point takes onnxruntime {np.median(micro):.0f} µs, worst of {calls}: {max(micro):.0f} µs"
-            kilobytes = at_most(f"{label}, file", path.stat().st_size / 1000, 100)
             found += [
-                seconds(f"{label}, written", taken, 10, note),
-                kilobytes._replace(unit="kB"),
+                at_most(f"{label}, written", taken, 10, unit="s", note=note),
+                at_most(f"{label}, file", path.stat().st_size / 1000, 100, unit="kB"),
                 within(label, velocity, ds, torch.from_numpy(points).double(), bound),
             ]
     return found

@@ -91,7 +91,17 @@ FLAWS: dict[str, Callable[[Array, int, Draw], Array]] = {
     "equal": lambda path, middle, draw: _with(path, slice(draw.choice([0, len(path) // 4]), None), path[0]),
 }
 """What spoils a path (N, n); ``middle`` is N // 2."""
-FORMS = ("float64", "float32", "float16", "int64", "strided", "transposed", "requires_grad", "numpy", "list")
+FORMS: dict[str, Callable[[Array], Any]] = {
+    "float64": torch.from_numpy,
+    "float32": lambda path: torch.from_numpy(path.astype(np.float32)),
+    "float16": lambda path: torch.from_numpy(path.astype(np.float16)),
+    "int64": lambda path: torch.from_numpy(path.astype(np.int64)),
+    "strided": lambda path: _strided(path),
+    "transposed": lambda path: torch.from_numpy(np.ascontiguousarray(path.T)).T,
+    "requires_grad": lambda path: torch.from_numpy(path).requires_grad_(),
+    "numpy": lambda path: path,
+    "list": lambda path: path.tolist(),
+}
 HUNG_AFTER = 60.0
 """Seconds."""
 
@@ -115,7 +125,7 @@ class Case(NamedTuple):
         draw = np.random.default_rng(self.seed)
         path = self.scale * _flawed(_path(self.shape, self.n_points, self.dim, draw), self.flaw, draw) + self.offset
         with np.errstate(over="ignore", invalid="ignore"):
-            return _handed_over(path, self.form)
+            return FORMS[self.form](path)
 
 
 def _path(shape: str, count: int, dim: int, draw: Draw) -> Array:
@@ -156,20 +166,10 @@ def _not_finite(path: Array, number: float, middle: int, draw: Draw) -> Array:
     return _with(path, (slice(middle, draw.choice([middle + 1, len(path)])), draw.integers(path.shape[1])), number)
 
 
-def _handed_over(path: Array, form: str) -> Any:
-    if form in ("float32", "float16", "int64"):
-        return torch.from_numpy(path.astype(form))
-    if form == "strided":
-        wide = np.zeros((2 * len(path), 3 * path.shape[1]))
-        wide[::2, ::3] = path
-        return torch.from_numpy(wide)[::2, ::3]
-    if form == "transposed":
-        return torch.from_numpy(np.ascontiguousarray(path.T)).T
-    if form == "requires_grad":
-        return torch.from_numpy(path).requires_grad_()
-    if form == "list":
-        return path.tolist()
-    return path if form == "numpy" else torch.from_numpy(path)
+def _strided(path: Array) -> torch.Tensor:
+    wide = np.zeros((2 * len(path), 3 * path.shape[1]))
+    wide[::2, ::3] = path
+    return torch.from_numpy(wide)[::2, ::3]
 
 
 def cases(largest: int = 5000) -> st.SearchStrategy[Case]:
@@ -180,7 +180,7 @@ def cases(largest: int = 5000) -> st.SearchStrategy[Case]:
         st.sampled_from([name for name in sorted(METHODS) for _ in range(1 if name == SLOW else 3)]),
         st.sampled_from(SHAPES),
         st.sampled_from([*FLAWS]),
-        st.sampled_from(FORMS),
+        st.sampled_from([*FORMS]),
         counts.map(lambda count: min(count, largest)),
         st.integers(1, 10),
         st.floats(-9, 9).map(lambda power: 10.0**power),

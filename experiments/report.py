@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
+import typer
+from matplotlib.axes import Axes
+from rich.console import Console
 from scipy import stats
 
 from latentds import report
@@ -38,6 +42,23 @@ def write(path: Path, content: str | dict[str, Any]) -> None:
     text = content if isinstance(content, str) else json.dumps(content, indent=2) + "\n"
     with atomic_write(path) as file:
         file.write(text.encode())
+
+
+@contextmanager
+def interruptible(console: Console) -> Iterator[None]:
+    """Ctrl-C ends the command with what a reader needs to know: the work that is done is kept."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        console.print("Interrupted; the same command goes on from here.")
+        raise typer.Exit(130) from None
+
+
+def plain(axes: Axes, grid: Literal["x", "y", "both"] = "both") -> None:
+    """Leave of a picture's frame what carries numbers, with a pale grid behind."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis=grid, color="#DDDDDD", lw=0.6)
+    axes.set_axisbelow(True)
 
 
 # --- scores over starts -----------------------------------------------------------------------------------------------
@@ -88,16 +109,18 @@ def goal_table(goals: Sequence[Goal]) -> str:
     return table([Goal._fields[i] for i in filled], [[line[i] for i in filled] for line in lines])
 
 
-def at_most(what: str, values: pd.Series[float] | float, bound: float, unit: str = "") -> Goal:
-    """That none of the values (of a number: it alone) is larger than ``bound``; names those that are."""
+def at_most(
+    what: str, values: pd.Series[float] | float, bound: float, suffix: str = "", *, unit: str = "", note: str = ""
+) -> Goal:
+    """That no value is larger than ``bound``; names those that are. ``suffix`` follows both, "≤ 10 s"."""
     series = values if isinstance(values, pd.Series) else pd.Series([float(values)])
     if series.empty:
-        return Goal(what, f"≤ {bound:g}{unit}", "not measured")
+        return Goal(what, f"≤ {bound:g}{suffix}", "not measured")
     over = series[~(series <= bound)]
-    reached = f"{series.max():.3g}{unit}"
+    reached = f"{series.max():.3g}{suffix}"
     if len(over) and len(series) > 1:
         reached += f"; above it: {', '.join(f'{name} {value:.3g}' for name, value in over.items())}"
-    return Goal(what, f"≤ {bound:g}{unit}", reached, met=over.empty)
+    return Goal(what, f"≤ {bound:g}{suffix}", reached, unit=unit, met=over.empty, note=note)
 
 
 def median(what: str, unit: str, bound: float, rounds: Array, *, at_most: bool = False, note: str = "") -> Goal:

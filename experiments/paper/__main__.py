@@ -73,15 +73,12 @@ def reproduce(plan: Plan, out: Path, doc: Path, jobs: int, recorded: Sequence[De
     console, began = Console(), time.perf_counter()
     study = Study(plan, out, jobs, recorded)
     document = Document(doc.parent / "images" / "reproduction")
-    try:
+    with report.interruptible(console):
         for title, section in SECTIONS.items():
             since = time.perf_counter()
             document.add(f"## {title}")
             section(study, document)
             console.print(f"{title}: {time.perf_counter() - since:.0f} s")
-    except KeyboardInterrupt:
-        console.print("Interrupted; the same command goes on from here.")
-        raise typer.Exit(130) from None
     seconds = time.perf_counter() - began
     report.write(doc, document.text(plan.quick, bool(recorded), seconds))
     report.write(out / "environment.json", report.environment())

@@ -63,8 +63,8 @@ class Document:
     def table(self, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
         self.add(report.table(header, list(rows)))
 
-    def find(self, *findings: Finding) -> None:
-        self.findings += findings
+    def find(self, what: str, paper: str, ours: str, verdict: str) -> None:
+        self.findings.append(Finding(what, paper, ours, verdict))
 
     def show(self, name: str, figure: Figure, caption: str) -> None:
         self.pictures.mkdir(parents=True, exist_ok=True)

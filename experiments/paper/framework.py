@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 
 from experiments.compared import greedy
-from experiments.paper.document import DPI, GOAL, Document, Finding
+from experiments.paper.document import DPI, GOAL, Document
 from experiments.paper.study import Study
 from experiments.published import TABLE_ONE
 from latentds import ChebyshevDS, Demonstration, LatentDS, datasets
@@ -31,7 +31,8 @@ def left_out(_: Study, document: Document) -> None:
         "End-effector paths of the kinesthetic cases": "the recordings are not public",
     }
     document.table(["what", "why"], missing.items())
-    document.find(*(Finding(what, "figure", "—", f"not reproducible: {why}") for what, why in missing.items()))
+    for what, why in missing.items():
+        document.find(what, "figure", "—", f"not reproducible: {why}")
 
 
 def draw_framework(shown: Demonstration, ds: LatentDS, n_nodes: int = 12) -> Figure:

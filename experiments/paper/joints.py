@@ -5,8 +5,8 @@ from __future__ import annotations
 from itertools import chain, repeat
 
 from experiments.compared import RIVALS, greedy
-from experiments.paper.document import Document, Finding
-from experiments.paper.study import Study, brief, paths
+from experiments.paper.document import Document
+from experiments.paper.study import Study, brief
 from experiments.published import TABLE_THREE
 from latentds import datasets, plotting
 from latentds.benchmark import Cell
@@ -16,7 +16,7 @@ def joints(study: Study, document: Document) -> None:
     motions = list(study.recorded) or [datasets.joint_motion(seed) for seed in range(study.plan.arms)]
     chosen = {(d.name, method): study.least_beta(method, d) for d in motions for method in RIVALS}
     cells = [Cell(method, greedy(method, chosen[d.name, method]), d) for d in motions for method in RIVALS]
-    rows, outcomes = study.run(cells, study.protocol(n_starts=0))
+    rows, paths = study.run(cells, study.protocol(n_starts=0))
     scores = rows.set_index(["demonstration", "method"])
     document.add(
         "The paper's six recordings are not public, so its scores cannot be reproduced; "
@@ -39,13 +39,11 @@ def joints(study: Study, document: Document) -> None:
     worst = max(motions, key=lambda shown: fast[shown.name])
     whose = "recordings of the user" if study.recorded else "made-up motions"
     for motion in dict.fromkeys((motions[0], worst)):
-        drawn = plotting.joints(motion, paths(outcomes, motion.name, RIVALS))
+        drawn = plotting.joints(motion, {method: paths[method, motion.name, 0] for method in RIVALS})
         document.show(f"joints_{motion.name.replace(' ', '_')}", drawn, f"{motion.name}: joints over time")
     document.find(
-        Finding(
-            "Table III, 7-D joint space",
-            f"FastDTW {min(TABLE_THREE.values())} … {max(TABLE_THREE.values())}",
-            f"{fast.min():.2f} … {fast.max():.2f} on {whose}",
-            "not reproducible: its recordings are not public",
-        )
+        "Table III, 7-D joint space",
+        f"FastDTW {min(TABLE_THREE.values())} … {max(TABLE_THREE.values())}",
+        f"{fast.min():.2f} … {fast.max():.2f} on {whose}",
+        "not reproducible: its recordings are not public",
     )

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from experiments.paper.document import DPI, REPRODUCED, Document, Finding, verdict
+from experiments.paper.document import DPI, REPRODUCED, Document, verdict
 from experiments.paper.study import Study, lines_of
 from latentds.arguments import Array
 from latentds.fitting.embedding import chebyshev_columns, chebyshev_eigenvalues, map_to_endpoints
@@ -51,39 +51,31 @@ def latent_space(_: Study, document: Document) -> None:
     even, odd = (eigenvalues[eigenvalues["n"] % 2 == parity] for parity in (0, 1))
     repeated, counted = "of the n smallest", bool((eigenvalues["per node"] == eigenvalues["paper"]).all())
     document.find(
-        Finding(
-            "Prop. 5: columns differ by O(1/N²)",
-            "k = −2",
-            f"k = {min(entry):.2f} … {max(entry):.2f} (entries), "
-            f"{min(norm):.2f} … {max(norm):.2f} (norm, u₁ = 1); equal for n = 2",
-            "contradicted: O(1/N)" if max(abs(k + 1) for k in entry) < 0.1 else "see the table",
-        ),
-        *(
-            Finding(what, "all", f"{frame[key].sum()} of {len(frame)} pairs of n and N", verdict(frame[key].all()))
-            for what, key in (
-                ("Lemma 2: columns are monotone", "monotone"),
-                ('"Interpoint spacing increases monotonically"', "spacing"),
-            )
-        ),
-        Finding(
-            "Lemma 3: λ < 2(1 − cos(π/N))",
-            "ratio < 1",
-            f"ratio at most {frame['bound'].max():.3f}",
-            verdict(frame["bound"].max() < 1),
-        ),
-        Finding(
-            '"n smallest repeating eigenvalues"',
-            "for every n",
-            f"even n: all n repeat: {(even[repeated] == even['n']).all()}; "
-            f"odd n: all but one: {(odd[repeated] == odd['n'] - 1).all()}",
-            "contradicted for odd n" if (odd[repeated] < odd["n"]).all() else REPRODUCED,
-        ),
-        Finding(
-            "Prop. 2: Λ eigenvalues of multiplicity 2",
-            "K/2 − 1 or (K − 1)/2",
-            f"that many per node: {counted}",
-            verdict(counted) + " as a count of pairs of blocks",
-        ),
+        "Prop. 5: columns differ by O(1/N²)",
+        "k = −2",
+        f"k = {min(entry):.2f} … {max(entry):.2f} (entries), "
+        f"{min(norm):.2f} … {max(norm):.2f} (norm, u₁ = 1); equal for n = 2",
+        "contradicted: O(1/N)" if max(abs(k + 1) for k in entry) < 0.1 else "see the table",
+    )
+    for what, key in (
+        ("Lemma 2: columns are monotone", "monotone"),
+        ('"Interpoint spacing increases monotonically"', "spacing"),
+    ):
+        document.find(what, "all", f"{frame[key].sum()} of {len(frame)} pairs of n and N", verdict(frame[key].all()))
+    largest = frame["bound"].max()
+    document.find("Lemma 3: λ < 2(1 − cos(π/N))", "ratio < 1", f"ratio at most {largest:.3f}", verdict(largest < 1))
+    document.find(
+        '"n smallest repeating eigenvalues"',
+        "for every n",
+        f"even n: all n repeat: {(even[repeated] == even['n']).all()}; "
+        f"odd n: all but one: {(odd[repeated] == odd['n'] - 1).all()}",
+        "contradicted for odd n" if (odd[repeated] < odd["n"]).all() else REPRODUCED,
+    )
+    document.find(
+        "Prop. 2: Λ eigenvalues of multiplicity 2",
+        "K/2 − 1 or (K − 1)/2",
+        f"that many per node: {counted}",
+        verdict(counted) + " as a count of pairs of blocks",
     )
 
 

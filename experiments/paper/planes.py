@@ -13,7 +13,7 @@ from torch import Tensor
 from baselines import DMP
 from baselines.dmp import FADING, STIFFNESS
 from experiments.compared import RIVALS, greedy, handwriting
-from experiments.paper.document import CONTRADICTED, DPI, GOAL, IN_PART, REPRODUCED, Document, Finding, verdict
+from experiments.paper.document import CONTRADICTED, DPI, GOAL, IN_PART, REPRODUCED, Document, verdict
 from experiments.paper.sensitivity import Variant
 from experiments.paper.study import Study, brief
 from experiments.report import welch
@@ -62,14 +62,12 @@ def planes(study: Study, document: Document) -> None:
     document.show("planes", draw_planes(drawn, fitted), caption)
     lost = {method: sum(distance > 0.01 for distance in distances) for method, distances in off.items()}
     document.find(
-        Finding(
-            '"FDM converges at an incorrect attractor" (third case)',
-            "FDM only, one motion",
-            f"ψ(x_N) is off by up to {max(off['FDM']):.1e} (FDM) and {max(off['Chebyshev']):.1e} (Chebyshev) "
-            f"sizes; by more than 1 % on {lost['FDM']} and {lost['Chebyshev']} of {len(lines)}; none with the exact "
-            "attractor",
-            REPRODUCED if lost["FDM"] and not lost["Chebyshev"] else IN_PART if lost["FDM"] else CONTRADICTED,
-        )
+        '"FDM converges at an incorrect attractor" (third case)',
+        "FDM only, one motion",
+        f"ψ(x_N) is off by up to {max(off['FDM']):.1e} (FDM) and {max(off['Chebyshev']):.1e} (Chebyshev) "
+        f"sizes; by more than 1 % on {lost['FDM']} and {lost['Chebyshev']} of {len(lines)}; none with the exact "
+        "attractor",
+        REPRODUCED if lost["FDM"] and not lost["Chebyshev"] else IN_PART if lost["FDM"] else CONTRADICTED,
     )
 
 
@@ -131,7 +129,7 @@ def orbits(_: Study, document: Document) -> None:
     document.show("dmp_orbits", drawn, f"{shown.name}: motions of a DMP and of TubeDS from the same {ORBITS} starts")
     counted = ", ".join(f"{method} {count}" for method, count in counts.items())
     crossed = verdict(counts["DMP"] and not counts["TubeDS"])
-    document.find(Finding("DMP's forward orbits", "cross", f"crossings: {counted}", crossed))
+    document.find("DMP's forward orbits", "cross", f"crossings: {counted}", crossed)
 
 
 def draw_orbits(shown: Demonstration, fitted: Mapping[str, StableDS], begins: Tensor) -> tuple[Figure, dict[str, int]]:

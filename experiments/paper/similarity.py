@@ -12,12 +12,12 @@ from matplotlib.figure import Figure
 from baselines import SDSEF
 from experiments.compared import RIVALS, greedy, spiral
 from experiments.paper.document import CONTRADICTED, DPI, IN_PART, NO_NUMBERS, REPRODUCED, Document, Finding
-from experiments.paper.study import Study, lines_of, paths, setting
+from experiments.paper.study import Study, lines_of, setting
 from experiments.paper.table_two import OFFICIAL, official_cells
-from experiments.report import mean_and_spread, mean_or_inf, paired, welch
+from experiments.report import mean_and_spread, mean_or_inf, paired, plain, welch
 from latentds import plotting
 from latentds.arguments import Array
-from latentds.benchmark import Cell, Outcome
+from latentds.benchmark import Cell, Paths
 from latentds.plotting import SHOWN, color_of
 
 SDS_EF = ("SDS-EF", OFFICIAL)
@@ -28,7 +28,7 @@ Scores = dict[str, dict[str, Array]]
 
 
 @cache
-def comparison(study: Study) -> tuple[pd.DataFrame, list[Outcome]]:
+def comparison(study: Study) -> tuple[pd.DataFrame, Paths]:
     """Every method on every spiral, from the demonstrated start and those around it."""
     (n_layers, n_features), cells = study.plan.tuned, official_cells(study)
     tuned = partial(SDSEF, n_layers=n_layers, n_features=n_features, epochs=study.plan.tuned_epochs)
@@ -71,7 +71,8 @@ def similarity(study: Study, document: Document) -> None:
         ),
     )
     document.show("p_values", draw_p_values(tests), "p of Welch's t-test, coloured by the nearer method")
-    document.find(*judge_similarity(tests))
+    for finding in judge_similarity(tests):
+        document.find(*finding)
     means = near["dtw"].agg(lambda scores: scores.mean(skipna=False))
     labels = [f"{method}{which}" for method in RIVALS for which in ("", ", least β", ", least MSE")]
     document.add(
@@ -139,7 +140,7 @@ def parameters(study: Study, document: Document) -> None:
         lines.append([*line, *(str(count[method]) for method in SDS_EF)])
         counts.append(count)
     document.table(["spiral", *EVERY], lines)
-    document.find(judge_parameters(pd.DataFrame(counts)))
+    document.find(*judge_parameters(pd.DataFrame(counts)))
 
 
 def judge_parameters(counts: pd.DataFrame) -> Finding:
@@ -157,11 +158,11 @@ def judge_parameters(counts: pd.DataFrame) -> Finding:
 
 def replications(study: Study, document: Document) -> None:
     for name in ("unstable c=7", "stable c=3"):
-        drawn = plotting.replications(spiral(name), paths(comparison(study)[1], name, EVERY))
+        drawn = plotting.replications(spiral(name), {m: comparison(study)[1][m, name, 0] for m in EVERY})
         caption = f"{name}: rollouts from the demonstrated and 20 other starts"
         document.show(name.replace(" ", "_").replace("=", ""), drawn, caption)
     what = "Replications, unstable c = 7 and stable c = 3"
-    document.find(Finding(what, "figures", "drawn; judged by DTW", NO_NUMBERS))
+    document.find(what, "figures", "drawn; judged by DTW", NO_NUMBERS)
 
 
 def draw_bars(scores: Mapping[str, Mapping[str, Array]], title: str) -> Figure:
@@ -187,9 +188,7 @@ def draw_bars(scores: Mapping[str, Mapping[str, Array]], title: str) -> Figure:
                 axes.text(place, 0.01, "×", ha="center", color=color)
     axes.set_xticks(range(len(scores)), list(scores), rotation=20, ha="right")
     axes.set(ylabel="FastDTW, normalised per spiral", title=title)
-    axes.grid(axis="y", color="#DDDDDD", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
+    plain(axes, "y")
     figure.legend(loc="outside lower center", ncols=len(methods), fontsize=9, frameon=False)
     return figure
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,7 @@ from experiments.compared import spiral
 from experiments.paper import tuning
 from experiments.published import TABLE_ONE, Setting
 from latentds import Demonstration, datasets
-from latentds.arguments import Array
-from latentds.benchmark import Cell, Outcome, RolloutProtocol, run
+from latentds.benchmark import Cell, Paths, RolloutProtocol, run, table
 from latentds.fitting.tuning import Choice, Tried, choose
 
 
@@ -99,10 +98,11 @@ class Study:
         """The plan's; ``n_starts`` of its own if given."""
         return RolloutProtocol(self.plan.n_starts if n_starts is None else n_starts, radius, self.plan.n_points)
 
-    def run(self, cells: Iterable[Cell], protocol: RolloutProtocol) -> tuple[pd.DataFrame, list[Outcome]]:
-        """Their rows, and their outcomes, which hold the paths; finished cells come from the store."""
-        outcomes = list(run(cells, protocol, n_jobs=self.jobs, progress=True, store=self.out / "cells.sqlite"))
-        return pd.DataFrame([row for outcome in outcomes for row in outcome.rows]), outcomes
+    def run(self, cells: Sequence[Cell], protocol: RolloutProtocol) -> tuple[pd.DataFrame, Paths]:
+        """Their rows and rollouts; finished cells come from the store."""
+        paths: Paths = {}
+        outcomes = run(cells, protocol, n_jobs=self.jobs, progress=True, store=self.out / "cells.sqlite")
+        return table(cells, outcomes, paths), paths
 
 
 def setting(tried: Tried) -> Setting:
@@ -112,12 +112,6 @@ def setting(tried: Tried) -> Setting:
 def brief(chosen: Setting) -> str:
     """A cell of the tables, "β / μ / M: MSE"."""
     return f"{chosen.beta:g} / {chosen.mu:g} / {chosen.n_layers}: {chosen.mse:.1e}"
-
-
-def paths(outcomes: Iterable[Outcome], name: str, methods: Iterable[str]) -> dict[str, Array]:
-    """{method: its rollouts} on the motion of that name."""
-    moved = {o.method: o.paths for o in outcomes if o.demonstration == name}
-    return {method: moved[method] for method in methods}
 
 
 def lines_of(frame: pd.DataFrame) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from experiments.compared import RIVALS, spiral
 from experiments.paper import tuning
-from experiments.paper.document import DPI, IN_PART, NO_NUMBERS, REPRODUCED, Document, Finding, similar, span
+from experiments.paper.document import DPI, IN_PART, NO_NUMBERS, REPRODUCED, Document, similar, span
 from experiments.paper.study import Study, brief, setting
 from experiments.published import TABLE_ONE
 from latentds import datasets
@@ -34,12 +34,10 @@ def table_one(_: Study, document: Document) -> None:
             lines.append([name, method, *numbers, similar(ratios[-1])])
     document.table(["spiral", "method", "β", "μ", "M", "paper", "ours", "ratio", "verdict"], lines)
     document.find(
-        Finding(
-            f"Table I at its own hyperparameters ({len(lines)} cells)",
-            f"MSE {span(cell.mse for cell in PRINTED)}",
-            f"{min(ratios):.2f} to {max(ratios):.2f} times the paper's",
-            similar(*ratios),
-        )
+        f"Table I at its own hyperparameters ({len(lines)} cells)",
+        f"MSE {span(cell.mse for cell in PRINTED)}",
+        f"{min(ratios):.2f} to {max(ratios):.2f} times the paper's",
+        similar(*ratios),
     )
 
 
@@ -73,19 +71,13 @@ def tuned(study: Study, document: Document) -> None:
     layers, fewer = [cell.n_layers for cell in PRINTED], sum(as_few)
     (beta, mu), least = min(errors.items(), key=lambda item: item[1])
     document.find(
-        Finding(
-            "Tuning by the paper's rule",
-            f"M from {min(layers)} to {max(layers)}",
-            f"as few layers as the paper's or fewer in {fewer} of {len(as_few)} cells",
-            REPRODUCED if fewer == len(as_few) else IN_PART if fewer else "worse",
-        ),
-        Finding(
-            "Heat map at M = 75, c = 7",
-            "a figure without numbers",
-            f"MSE {least:.1e} (β {beta:g}, μ {mu:g}) to {max(errors.values()):.1e}",
-            NO_NUMBERS,
-        ),
+        "Tuning by the paper's rule",
+        f"M from {min(layers)} to {max(layers)}",
+        f"as few layers as the paper's or fewer in {fewer} of {len(as_few)} cells",
+        REPRODUCED if fewer == len(as_few) else IN_PART if fewer else "worse",
     )
+    ours = f"MSE {least:.1e} (β {beta:g}, μ {mu:g}) to {max(errors.values()):.1e}"
+    document.find("Heat map at M = 75, c = 7", "a figure without numbers", ours, NO_NUMBERS)
 
 
 def heat_map(errors: Mapping[tuple[float, float], float], title: str) -> Figure:

@@ -8,7 +8,8 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from experiments.training.loop import Learned, Loop, plain, solid
+from experiments.report import plain
+from experiments.training.loop import Learned, Loop, solid
 from latentds import TubeDS, datasets, plotting
 
 CAMERAS = ((1.0, 0.0, 0.3), (0.0, 1.0, 0.0))

@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal, Normal, TransformedDistribution
 
-from experiments.training.loop import Learned, Loop, plain
+from experiments.report import plain
+from experiments.training.loop import Learned, Loop
 from latentds import LocallyWeightedTranslations, as_transform, plotting
 
 REACH, SPREAD, SPAN = 0.6, 0.05, math.radians(240)

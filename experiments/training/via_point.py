@@ -10,7 +10,8 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from experiments.training.loop import Learned, Loop, plain, solid
+from experiments.report import plain
+from experiments.training.loop import Learned, Loop, solid
 from latentds import Demonstration, StableDS, TubeDS, certify, datasets, plotting
 
 BALL = 0.1

@@ -16,7 +16,7 @@ from experiments.paper.planes import crossings
 from experiments.paper.sensitivity import Variant
 from experiments.paper.similarity import judge_parameters, judge_similarity
 from experiments.paper.study import Plan
-from experiments.paper.table_two import HeldOut
+from experiments.paper.table_two import held_out, held_out_samples
 from experiments.paper.tuning import Grid
 from experiments.published import Setting
 from latentds import benchmark, datasets
@@ -56,18 +56,22 @@ def test_tuning_tries_the_whole_grid_once_and_is_kept(tmp_path, monkeypatch):
     assert tuning.tune("FDM", shown, SMALL, tmp_path / "optuna.sqlite", 1) == (grid, more)
 
 
-def test_sdsef_is_judged_where_it_was_not_trained(monkeypatch):
+def test_sdsef_is_judged_where_it_was_not_trained():
     shown = datasets.unstable_spiral(1, 100)
-    ds = HeldOut(3, n_layers=2, n_features=8, epochs=2)
-    trained = []
-    learn = ds.learner._learn
-    monkeypatch.setattr(ds.learner, "_learn", lambda some, progress: (trained.extend(some), learn(some, progress))[1])
-    ds.fit(shown)
-    assert len(trained[0]) == 70  # 30 of 98 between the ends are held out
-    assert trained[0].duration == pytest.approx(shown.duration)
-    torch.testing.assert_close(ds.attractor, shown.goal)
+    cell = held_out(shown, n_layers=2, n_features=8, epochs=2)
+    (trained_on,) = cell.shown
+    assert len(trained_on) == 70  # 30 of 98 between the ends are held out
+    assert trained_on.duration == pytest.approx(shown.duration)
+    torch.testing.assert_close(trained_on.goal, shown.goal)
+    elsewhere = shown.positions.clone()
+    elsewhere[held_out_samples(100)] += 1
+    unseen = held_out(replace(shown, positions=elsewhere), n_layers=2, n_features=8, epochs=2)
+    assert torch.equal(unseen.shown[0].positions, trained_on.positions)
+    ds = cell.factory(3).fit(trained_on)
     whole = (ds(shown.positions) - shown.velocities).square().mean(1).detach().numpy()
-    assert whole.min() < ds.fit_report.mse < whole.max()
+    error = cell.measure(ds, cell)["test_mse"]
+    assert error == pytest.approx(whole[held_out_samples(100)].mean())
+    assert whole.min() < error < whole.max()
 
 
 @pytest.mark.parametrize("n", [2, 3, 5])

@@ -91,7 +91,7 @@ def test_a_run_that_was_stopped_ends_where_it_would_have_ended(task, tmp_path, s
     if stop < 50:
         with pytest.raises(KeyboardInterrupt):
             plan("stopped").run(stopped, fails)
-        assert (tmp_path / "stopped").exists() == (stop >= loop.EVERY)
+        assert (tmp_path / "stopped").exists() == (stop >= loop.STEPS_PER_CHECKPOINT)
     else:
         plan("stopped").run(stopped, fails)
     again, loss = task()
