@@ -5,7 +5,7 @@
 Rivals take turns, and what counts are ratios of medians, in CPU time of the one thread that computes: other processes
 then slow both through shared caches only, where in wall time they would interrupt the longer call more often than the
 shorter one. A control loop's latency is wall time, interruptions included, so run this on an otherwise idle machine.
-Leaves report.csv, growth.csv, summary.md, growth.png and environment.json in ``--out``.
+Leaves goals.csv, growth.csv, summary.md, growth.png and environment.json in ``--out``.
 """
 
 from __future__ import annotations
@@ -100,11 +100,6 @@ def race(what: str, least: float, slow: Callable[[], Any], fast: Callable[[], An
 # --- studies ----------------------------------------------------------------------------------------------------------
 
 
-def few(rounds: int) -> int:
-    """Of what takes long."""
-    return max(3, rounds // 4)
-
-
 def latent_points(ds: ChebyshevDS, count: int, seed: int = 0) -> Tensor:
     """Spread around the motion: as rollouts from everywhere near it would visit."""
     generator = torch.Generator().manual_seed(seed)
@@ -114,15 +109,9 @@ def latent_points(ds: ChebyshevDS, count: int, seed: int = 0) -> Tensor:
 
 def against_floor(ds: ChebyshevDS, rounds: int) -> list[Goal]:
     layers, x = loops.layers_of(ds), latent_points(ds, 100_000)
-    decode, buffer, repeats = partial(ds.decode, x), np.full(BLOCK, 0.5), 20_000
-    times = take_turns(
-        {
-            "decode": decode,
-            "exponentials": partial(exponentials, buffer, repeats),
-            "products": partial(products, buffer, repeats),
-        },
-        rounds,
-    )
+    buffer, repeats = np.full(BLOCK, 0.5), 20_000
+    floors = {"exponentials": partial(exponentials, buffer, repeats), "products": partial(products, buffer, repeats)}
+    times = take_turns({"decode": partial(ds.decode, x), **floors}, rounds)
     each_exp = times["exponentials"] / repeats / BLOCK
     each_product = times["products"] / repeats / 12 / WIDTH
     floor = (each_exp + operations(3) * each_product) * N_LAYERS * len(x)
@@ -130,12 +119,9 @@ def against_floor(ds: ChebyshevDS, rounds: int) -> list[Goal]:
         f"floor {np.median(floor) / N_LAYERS / len(x) * 1e9:.2f} ns a layer and point: exponential "
         f"{np.median(each_exp) * 1e9:.2f} ns, {operations(3)} operations of {np.median(each_product) * 1e9:.3f} ns"
     )
-    return [
-        report.median("decode 10⁵ points", "times the floor", 2.5, times["decode"] / floor, at_most=True, note=note),
-        race(
-            "decode 10⁵ points, torch loop", 35, partial(loops.forward, layers, x), partial(ds.decode, x), few(rounds)
-        ),
-    ]
+    above = report.median("decode 10⁵ points", "times the floor", 2.5, times["decode"] / floor, at_most=True, note=note)
+    loop = partial(loops.forward, layers, x)
+    return [above, race("decode 10⁵ points, torch loop", 35, loop, partial(ds.decode, x), max(3, rounds // 4))]
 
 
 def against_loop(ds: ChebyshevDS, rounds: int) -> list[Goal]:
@@ -144,19 +130,16 @@ def against_loop(ds: ChebyshevDS, rounds: int) -> list[Goal]:
     def latent_velocity(x: Tensor) -> Tensor:
         return ds.dynamics(x, x, ds.frame())
 
-    found = []
-    for label, points, least in (
-        ("velocity of 1000 points", many, 80),
-        ("velocity of one point, ds(y)", SHOWN.positions[400], 100),
-    ):
+    one, goals = SHOWN.positions[400], []
+    for label, points, least in (("velocity of 1000 points", many, 80), ("velocity of one point, ds(y)", one, 100)):
         fast, slow = partial(ds, points), partial(loops.velocity, layers, points, latent_velocity)
         torch.testing.assert_close(fast(), slow(), rtol=1e-8, atol=1e-8)
-        found.append(race(f"{label}, torch loop", least, slow, fast, rounds))
-    return found
+        goals.append(race(f"{label}, torch loop", least, slow, fast, rounds))
+    return goals
 
 
 def control_loop(calls: int) -> list[Goal]:
-    found = []
+    goals = []
     for n_layers, most in ((150, 60), (750, 120)):
         controller = ChebyshevDS(3, n_layers=n_layers).fit(SHOWN).controller()
         points, out = SHOWN.positions.numpy(), np.empty(3)
@@ -169,11 +152,11 @@ def control_loop(calls: int) -> list[Goal]:
                 seconds[i] = clock() - began
         micro = wall * 1e6
         label = f"controller(y), M = {n_layers}"
-        found.append(report.median(f"{label}, median", "µs", most, micro, at_most=True))
+        goals.append(report.median(f"{label}, median", "µs", most, micro, at_most=True))
         late = float(np.quantile(micro, 0.99))
         note = f"worst of {calls}: {micro.max():.0f} µs; of CPU time {np.quantile(busy, 0.99) * 1e6:.0f} µs"
-        found.append(at_most(f"{label}, 99th percentile", late, 1000, unit="µs", note=note))
-    return found
+        goals.append(at_most(f"{label}, 99th percentile", late, 1000, unit="µs", note=note))
+    return goals
 
 
 def rollouts(ds: ChebyshevDS, rounds: int) -> list[Goal]:
@@ -181,17 +164,19 @@ def rollouts(ds: ChebyshevDS, rounds: int) -> list[Goal]:
     starts = SHOWN.start + 0.1 * torch.randn(16, 3, generator=generator, dtype=torch.float64)
     times = torch.linspace(0, SHOWN.duration, 1000, dtype=torch.float64)
     fast, slow = partial(ds.rollout, starts, times), partial(loops.runge_kutta, ds, starts, times)
-    clock = take_turns({"fast": fast, "rk4": slow}, few(rounds))
+    clock = take_turns({"fast": fast, "rk4": slow}, max(3, rounds // 4))
     controller = ds.controller()
-    found = fast()
+
+    def field(_: float, y: Array) -> Array:
+        return controller(y)
+
+    closed_form = fast()
     began, worst = time.thread_time(), 0.0
-    for start, path in zip(starts.numpy(), found.numpy(), strict=True):
-        exact = solve_ivp(
-            lambda _, y: controller(y), (0, SHOWN.duration), start, "RK45", times.numpy(), rtol=1e-9, atol=1e-12
-        )
+    for start, path in zip(starts.numpy(), closed_form.numpy(), strict=True):
+        exact = solve_ivp(field, (0, SHOWN.duration), start, "RK45", times.numpy(), rtol=1e-9, atol=1e-12)
         worst = max(worst, float(np.abs(exact.y.T - path).max()))
     seconds = np.array([time.thread_time() - began])
-    coarse = float((slow() - found).abs().max())
+    coarse = float((slow() - closed_form).abs().max())
     note = f"RK4 of 1000 steps: {coarse:.1e}"
     return [
         report.ratio("rollout 16 x 1000, RK4 on ds(y)", 60, clock["rk4"], clock["fast"]),
@@ -216,13 +201,13 @@ def gradients(rounds: int) -> list[Goal]:
         with reference():
             return gradient(loss)
 
-    found = []
+    goals = []
     for name, loss in losses.items():
         fast, slow = partial(gradient, loss), partial(by_torch, loss)
         apart = float((fast() - slow()).norm() / slow().norm())
-        goal = race(f"gradient of the {name}, M = 300, N = 1000, torch path", 10, slow, fast, few(rounds))
-        found += [goal, at_most("... relative difference", apart, 1e-10)]
-    return found
+        goal = race(f"gradient of the {name}, M = 300, N = 1000, torch path", 10, slow, fast, max(3, rounds // 4))
+        goals += [goal, at_most("... relative difference", apart, 1e-10)]
+    return goals
 
 
 def fits(rounds: int) -> list[Goal]:
@@ -234,7 +219,7 @@ def fits(rounds: int) -> list[Goal]:
     theirs = slow()
     note = f"MSE {error:.3g} against {theirs:.3g}"
     return [
-        race("fit, M = 300, N = 1000, bounded scalar search", 30, slow, fast, few(rounds)),
+        race("fit, M = 300, N = 1000, bounded scalar search", 30, slow, fast, max(3, rounds // 4)),
         at_most("fit, MSE over that of the bounded search", error / theirs, 1, unit="ratio", note=note),
     ]
 
@@ -277,25 +262,27 @@ def sdsef_step(rounds: int) -> list[Goal]:
 
 
 def growth(quick: bool) -> pd.DataFrame:
-    """Seconds of each call as N or M grows, and the exponent of the last decade or so."""
+    """Seconds of each call as N or M grows."""
     rows = []
+
+    def measure(grows: str, size: int, calls: Mapping[str, Callable[[], Any]], rounds: int) -> None:
+        for call, seconds in take_turns(calls, rounds).items():
+            rows.append((grows, call, size, float(np.median(seconds))))
+
     ds = ChebyshevDS(3, n_layers=N_LAYERS).fit(SHOWN)
-    for count in (1, 10, 100, 1000, 10_000, 100_000) if quick else (1, 10, 100, 1000, 10_000, 100_000, 1_000_000):
+    for count in (10**power for power in range(6 if quick else 7)):
         x = latent_points(ds, count)
         y = ds.decode(x)
         calls = {"decode": partial(ds.decode, x), "encode": partial(ds.encode, y), "velocity": partial(ds, y)}
-        for call, values in take_turns(calls, 5).items():
-            rows.append(("N", call, count, float(np.median(values))))
+        measure("N", count, calls, 5)
     for n_layers in (25, 50, 100, 200, 400, 800):
         ds = ChebyshevDS(3, n_layers=n_layers).fit(SHOWN)
         y = ds.decode(latent_points(ds, 10_000))
-        for call, values in take_turns({"velocity": partial(ds, y), "fit": partial(ds.fit, SHOWN)}, 3).items():
-            rows.append(("M", call, n_layers, float(np.median(values))))
+        measure("M", n_layers, {"velocity": partial(ds, y), "fit": partial(ds.fit, SHOWN)}, 3)
     for count in (125, 250, 500, 1000, 2000, 4000, 8000):
         shown = datasets.unstable_spiral(7, count)
-        fit = partial(match, ChebyshevDS.latent_line(shown), shown.positions.numpy(), N_LAYERS, 0.5, 0.9)
-        values = take_turns({"match": fit}, 5)["match"]
-        rows.append(("N", "match", count, float(np.median(values))))
+        line, positions = ChebyshevDS.latent_line(shown), shown.positions.numpy()
+        measure("N", count, {"match": partial(match, line, positions, N_LAYERS, 0.5, 0.9)}, 5)
     return pd.DataFrame(rows, columns=["grows", "call", "size", "seconds"])
 
 
@@ -333,7 +320,7 @@ def main(
     console, rounds = Console(), 9 if quick else 41
     kernels.warmup([3])
     ds = ChebyshevDS(3, n_layers=N_LAYERS).fit(SHOWN)
-    found = [
+    goals = [
         *against_floor(ds, rounds),
         *against_loop(ds, rounds),
         *control_loop(2000 if quick else 20_000),
@@ -344,24 +331,18 @@ def main(
         *deployed.measure(quick),
     ]
     curves = growth(quick)
-    summary = "\n\n".join(
-        [
-            f"Load average while it ran: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; 1 core is used.",
-            report.goal_table(found),
-            report.table(
-                ("grows", "call", "from", "to", "exponent of the time"),
-                [(*map(str, row[:-1]), f"{row[-1]:.2f}") for row in exponents(curves).itertuples(index=False)],
-            ),
-        ]
-    )
+    load = f"Load average while it ran: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; 1 core is used."
+    powers = [(*map(str, row[:-1]), f"{row[-1]:.2f}") for row in exponents(curves).itertuples(index=False)]
+    growth_table = report.table(("grows", "call", "from", "to", "exponent of the time"), powers)
+    summary = "\n\n".join([load, report.goal_table(goals), growth_table])
     out.mkdir(parents=True, exist_ok=True)
-    report.write(out / "report.csv", pd.DataFrame(found).to_csv(index=False))
+    report.write(out / "goals.csv", pd.DataFrame(goals).to_csv(index=False))
     report.write(out / "growth.csv", curves.to_csv(index=False))
     report.write(out / "summary.md", summary + "\n")
     report.write(out / "environment.json", report.environment())
     draw_growth(curves).savefig(out / "growth.png", dpi=150)
     console.print(Markdown(summary))
-    console.print(f"{out}: summary.md, report.csv, growth.csv, growth.png, environment.json")
+    console.print(f"{out}: summary.md, goals.csv, growth.csv, growth.png, environment.json")
 
 
 if __name__ == "__main__":
