@@ -275,24 +275,16 @@ def ideas(rows: pd.DataFrame) -> str:
 
 def each_spiral(rows: pd.DataFrame, best: dict[str, tuple[float, float]]) -> str:
     lines = []
-    for name, (least, tube_alone) in best.items():
+    for name, (floor, joined) in best.items():
         of = rows[(rows["demonstration"] == name) & (rows["family"] != HALF_LAYERS)]
         dtw = {label: mine.set_index("start")["dtw"] for label, mine in of.groupby("method")}
         twenty, many = dtw["TubeDS"].drop(0), dtw[f"TubeDS, {MORE_STARTS.n_starts} starts"].drop(0)
         rivals = [dtw[label].drop(0).mean() for label in GREEDY]
-        numbers = [dtw["TubeDS"][0], twenty.mean(), twenty.max(), many.mean(), many.max(), tube_alone, least, *rivals]
+        numbers = [dtw["TubeDS"][0], twenty.mean(), twenty.max(), many.mean(), many.max(), joined, floor, *rivals]
         homotopy = of[of["method"] == "TubeDS"]["homotopy"].iloc[0]
         lines.append([name, *(f"{number:.2f}" for number in numbers), homotopy])
-    ours = (
-        "shown start",
-        "20 starts, mean",
-        "worst",
-        f"{MORE_STARTS.n_starts} starts, mean",
-        "worst",
-        "joined",
-        "floor",
-    )
-    return report.table(("spiral", *ours, "Chebyshev, 20", "FDM, 20", "homotopy"), lines)
+    many_starts = (f"{MORE_STARTS.n_starts} starts, mean", "worst", "joined", "floor", "Chebyshev, 20", "FDM, 20")
+    return report.table(("spiral", "shown start", "20 starts, mean", "worst", *many_starts, "homotopy"), lines)
 
 
 def contraction(rows: pd.DataFrame) -> str:
@@ -379,10 +371,7 @@ def main(
 ) -> None:
     """Turn the ideas of TubeDS on and off."""
     began, console = time.perf_counter(), Console()
-    try:
-        recorded = recordings(data or [])
-    except (ValueError, FileNotFoundError) as error:
-        raise typer.BadParameter(str(error)) from None
+    recorded = recordings(data or [])
     shown, written = spirals(quick), dict(list(handwriting().items())[:: 9 if quick else 1])
     if not written:
         console.print("LASA handwriting is not installed and left out: run `make lasa` once.")

@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import typer
+
 from baselines import FDM, SDSEF
 from experiments.published import TABLE_ONE, Setting
 from latentds import ChebyshevDS, Demonstration, TubeDS, datasets
@@ -70,15 +72,17 @@ def recordings(paths: Sequence[Path]) -> list[Demonstration]:
     """What the files hold, and all files of the folders that a demonstration is read from, in alphabetical order.
 
     Raises:
-        ValueError: if there is none, one is no recording, or two have one name.
-        FileNotFoundError: if there is no such file.
+        typer.BadParameter: if there is none, one is no recording or no file, or two have one name.
     """
     every = [file for path in paths for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
     files = [file for file in every if file.suffix.lower() in READERS]
     if paths and not files:
         folders = ", ".join(map(str, paths))
-        raise ValueError(f"data: expected files of kind {' '.join(READERS)}, found none in {folders}")
-    recorded = [Demonstration.load(file) for file in files]
+        raise typer.BadParameter(f"data: expected files of kind {' '.join(READERS)}, found none in {folders}")
+    try:
+        recorded = [Demonstration.load(file) for file in files]
+    except (ValueError, FileNotFoundError) as error:
+        raise typer.BadParameter(str(error)) from None
     if repeated := [name for name, count in Counter(d.name for d in recorded).items() if count > 1]:
-        raise ValueError(f"data: expected recordings of different names, got {repeated[0]!r} again")
+        raise typer.BadParameter(f"data: expected recordings of different names, got {repeated[0]!r} again")
     return recorded

@@ -63,9 +63,7 @@ WINDING: dict[str, Callable[[Array, Array, Draw], tuple[Array, ...]]] = {
     "near trefoil": lambda t, near, draw: (
         np.sin(near) + 2 * np.sin(2 * near), np.cos(near) - 2 * np.cos(2 * near), -np.sin(3 * near)
     ),
-    "helix": lambda t, near, draw: (
-        *_spiral(1.0, 2 * np.pi * draw.uniform(2, 30) * t), draw.uniform(0.5, 4) * t
-    ),
+    "helix": lambda t, near, draw: (*_spiral(1.0, 2 * np.pi * draw.uniform(2, 30) * t), draw.uniform(0.5, 4) * t),
     "loop-the-loop": lambda t, near, draw: _loop_the_loop(t, draw.uniform(0.05, 0.5)),
 }  # fmt: skip
 """Coordinates (N,) each of curves in a plane or in space that wind, or come back to where they began, or nearly so.
@@ -192,16 +190,10 @@ def cases(largest: int = 5000) -> st.SearchStrategy[Case]:
 
 FOLLOWS, SAYS, REFUSED, BROKEN = "follows", "says that it does not follow", "refused", "BROKEN"
 EXCUSED = (
-    "decode inverts encode",
-    "encode inverts decode",
-    "the closed-form Jacobian is autograd's",
-    "ψ neither folds nor flattens space",
-    "V is above 0, and falls to 0 at the attractor",
-    "V falls along motions",
-    "a motion is its two halves",
-    "every motion arrives within 100 durations",
-    "follows its demonstration",
-)
+    "decode inverts encode", "encode inverts decode", "the closed-form Jacobian is autograd's",
+    "ψ neither folds nor flattens space", "V is above 0, and falls to 0 at the attractor", "V falls along motions",
+    "a motion is its two halves", "every motion arrives within 100 durations", "follows its demonstration",
+)  # fmt: skip
 """Claims that may be false of a fit that says that it does not follow: what only floats break, and its timing."""
 FLAT_COSINE = 1e-12
 """A cosine of ∇V and f that is no larger is none that such a fit's rounding tells from 0."""

@@ -59,11 +59,8 @@ def main(
     """Reproduce the paper. An interrupted run goes on where it stopped."""
     out = out or Path("results/paper-quick" if quick else "results/paper")
     doc = doc or (out / "reproduction.md" if quick else Path("docs/reproduction.md"))
-    try:
-        recorded = recordings([data] if data else [])
-    except (ValueError, FileNotFoundError) as error:
-        raise typer.BadParameter(str(error)) from None
-    reproduce(QUICK if quick else FULL, out, doc, joblib.cpu_count() if jobs is None else jobs, recorded)
+    n_jobs = joblib.cpu_count() if jobs is None else jobs
+    reproduce(QUICK if quick else FULL, out, doc, n_jobs, recordings([data] if data else []))
 
 
 def reproduce(plan: Plan, out: Path, doc: Path, jobs: int, recorded: Sequence[Demonstration] = ()) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import product
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
 from experiments.paper.document import DPI, REPRODUCED, Document, verdict
-from experiments.paper.study import Study, lines_of
+from experiments.paper.study import Study
 from latentds.arguments import Array
 from latentds.fitting.embedding import chebyshev_columns, chebyshev_eigenvalues, map_to_endpoints
 from latentds.plotting import SHOWN
@@ -45,7 +46,7 @@ def latent_space(_: Study, document: Document) -> None:
         "pairs of equal blocks; each pair repeats one eigenvalue per node."
     )
     header = ["n", "K", "Λ, paper", "distinct eigenvalues of multiplicity 2", "per node"]
-    rows = [[f"{value:g}" for value in line.values()] for line in lines_of(eigenvalues)]
+    rows = [[f"{value:g}" for value in row] for row in eigenvalues.itertuples(index=False)]
     document.table([*header, "repeated among the n smallest > 0"], rows)
     entry, norm = (exponents[key].values() for key in ("entry", "norm"))
     even, odd = (eigenvalues[eigenvalues["n"] % 2 == parity] for parity in (0, 1))
@@ -87,28 +88,21 @@ def embedding(dims: Sequence[int] = DIMS, counts: Sequence[int] = COUNTS) -> pd.
     in its lengths; ``bound``: the largest λ over Lemma 3's bound; ``limit``: λN² over π²/4.
     """
     rows = []
-    for n in dims:
-        for count in counts:
-            columns, eigenvalues = chebyshev_columns(count, n), chebyshev_eigenvalues(count, n)
-            units = columns / np.linalg.norm(columns, axis=0)
-            gaps = columns[:, :, None] - columns[:, None, :]
-            placed = map_to_endpoints(columns, np.zeros(n), np.ones(n))
-            aside = placed - placed.mean(axis=1, keepdims=True)
-            steps = np.diff(columns, axis=0)
-            rows.append(
-                {
-                    "n": n,
-                    "N": count,
-                    "entry": np.abs(gaps).max(),
-                    "norm": np.linalg.norm(gaps, axis=0).max(),
-                    "unit": np.linalg.norm(units[:, :, None] - units[:, None, :], axis=0).max(),
-                    "bend": np.linalg.norm(aside, axis=1).max() / np.sqrt(n),
-                    "monotone": bool((steps < 0).all()),
-                    "spacing": bool((np.diff(np.abs(steps), axis=0) > 0).all()),
-                    "bound": (eigenvalues / (2 * (1 - np.cos(np.pi / count)))).max(),
-                    "limit": (eigenvalues * count**2 / (np.pi**2 / 4)).min(),
-                }
-            )
+    for n, count in product(dims, counts):
+        columns, eigenvalues = chebyshev_columns(count, n), chebyshev_eigenvalues(count, n)
+        units = columns / np.linalg.norm(columns, axis=0)
+        gaps = columns[:, :, None] - columns[:, None, :]
+        placed = map_to_endpoints(columns, np.zeros(n), np.ones(n))
+        aside = placed - placed.mean(axis=1, keepdims=True)
+        steps = np.diff(columns, axis=0)
+        row = {"n": n, "N": count, "entry": np.abs(gaps).max(), "norm": np.linalg.norm(gaps, axis=0).max()}
+        row["unit"] = np.linalg.norm(units[:, :, None] - units[:, None, :], axis=0).max()
+        row["bend"] = np.linalg.norm(aside, axis=1).max() / np.sqrt(n)
+        row["monotone"] = bool((steps < 0).all())
+        row["spacing"] = bool((np.diff(np.abs(steps), axis=0) > 0).all())
+        row["bound"] = (eigenvalues / (2 * (1 - np.cos(np.pi / count)))).max()
+        row["limit"] = (eigenvalues * count**2 / (np.pi**2 / 4)).min()
+        rows.append(row)
     return pd.DataFrame(rows)
 
 
@@ -135,18 +129,10 @@ def spectrum(dims: Sequence[int] = DIMS, count: int = PATH_NODES) -> pd.DataFram
     for n in dims:
         values = np.linalg.eigvalsh(laplacian(count, n))
         times = np.array([(np.abs(values - value) < 1e-9).sum() for value in values])
-        copies = n + 1
-        rows.append(
-            {
-                "n": n,
-                "K": copies,
-                "paper": copies // 2 - 1 if copies % 2 == 0 else (copies - 1) // 2,
-                "distinct": int((times == 2).sum() // 2),
-                "per node": (times == 2).sum() / 2 / count,
-                "of the n smallest": int((times[1 : n + 1] == 2).sum()),
-            }
-        )
-    return pd.DataFrame(rows)
+        copies, twice = n + 1, (times == 2).sum()
+        counted = copies // 2 - 1 if copies % 2 == 0 else (copies - 1) // 2
+        rows.append((n, copies, counted, twice // 2, twice / 2 / count, (times[1 : n + 1] == 2).sum()))
+    return pd.DataFrame(rows, columns=["n", "K", "paper", "distinct", "per node", "of the n smallest"])
 
 
 def draw_linearity(frame: pd.DataFrame, slopes: Mapping[int, float]) -> Figure:

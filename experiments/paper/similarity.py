@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from baselines import SDSEF
 from experiments.compared import RIVALS, greedy, spiral
 from experiments.paper.document import CONTRADICTED, DPI, IN_PART, NO_NUMBERS, REPRODUCED, Document, Finding
-from experiments.paper.study import Study, lines_of, setting
+from experiments.paper.study import Study, setting
 from experiments.paper.table_two import OFFICIAL, official_cells
 from experiments.report import mean_and_spread, mean_or_inf, paired, plain, welch
 from latentds import plotting
@@ -62,14 +62,11 @@ def similarity(study: Study, document: Document) -> None:
     document.show("dtw", drawn, "The paper's DTW bars; × did not finish")
     document.add("Each cell is mean FastDTW · mean exact DTW, raw sums.")
     tests = p_values(fast, exact)
-    document.table(
-        ["spiral", *EVERY, "p, FastDTW", "p, exact", "p paired, exact"],
-        (
-            [name, *(f"{mean_and_spread(fast[name][m])} · {mean_and_spread(exact[name][m])}" for m in EVERY)]
-            + [f"{test[key]:.1e}" for key in ("fast", "exact", "paired")]
-            for name, test in zip(fast, lines_of(tests), strict=True)
-        ),
-    )
+    lines = []
+    for name, p in zip(fast, tests[["fast", "exact", "paired"]].to_numpy(), strict=True):
+        scores = [f"{mean_and_spread(fast[name][m])} · {mean_and_spread(exact[name][m])}" for m in EVERY]
+        lines.append([name, *scores, *(f"{value:.1e}" for value in p)])
+    document.table(["spiral", *EVERY, "p, FastDTW", "p, exact", "p paired, exact"], lines)
     document.show("p_values", draw_p_values(tests), "p of Welch's t-test, coloured by the nearer method")
     for finding in judge_similarity(tests):
         document.find(*finding)

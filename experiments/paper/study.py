@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
@@ -112,8 +111,3 @@ def setting(tried: Tried) -> Setting:
 def brief(chosen: Setting) -> str:
     """A cell of the tables, "β / μ / M: MSE"."""
     return f"{chosen.beta:g} / {chosen.mu:g} / {chosen.n_layers}: {chosen.mse:.1e}"
-
-
-def lines_of(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """The lines of a frame, one by one."""
-    return frame.to_dict("records")  # type: ignore[return-value]

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+import typer
 
 from experiments import compared
 from latentds import Demonstration, datasets
@@ -25,11 +26,11 @@ def test_recordings_are_read_from_files_and_folders(tmp_path):
         Demonstration(shown.positions, shown.dt, name).save(tmp_path / f"{name}.{ending}")
     assert [shown.name for shown in compared.recordings([tmp_path])] == ["one", "two"]
     assert [shown.name for shown in compared.recordings([tmp_path / "two.npz"])] == ["two"]
-    with pytest.raises(ValueError, match="data: expected recordings of different names"):
+    with pytest.raises(typer.BadParameter, match="data: expected recordings of different names"):
         compared.recordings([tmp_path, tmp_path / "one.csv"])
-    with pytest.raises(ValueError, match=r"data: expected files of kind \.csv .*\.npz.*, found none in .*nothing"):
+    with pytest.raises(typer.BadParameter, match=r"data: expected files of kind \.csv .*\.npz.*none in .*nothing"):
         compared.recordings([tmp_path / "nothing"])
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(typer.BadParameter, match="nothing"):
         compared.recordings([tmp_path / "nothing.npz"])
 
 
