@@ -189,6 +189,7 @@ def joined_floor(shown: Demonstration, protocol: RolloutProtocol, starts: Array,
 
 
 def judge(rows: pd.DataFrame, seconds: dict[bool, float]) -> list[Goal]:
+    """The goals; ``seconds`` is {refined: of a fit}."""
     ours = rows[rows["method"] == "TubeDS"]
     sphere = ours[ours["family"].isin(("unstable", "stable"))]
     near = sphere[sphere["start"] > 0].groupby("demonstration", sort=False)["dtw"]
@@ -223,6 +224,7 @@ def judge(rows: pd.DataFrame, seconds: dict[bool, float]) -> list[Goal]:
 
 
 def layer_goals(rows: pd.DataFrame) -> list[Goal]:
+    """The paper's MSE with half of its layers."""
     listed = []
     for _, row in rows[(rows["family"] == HALF_LAYERS) & (rows["start"] == 0)].iterrows():
         name, label, reached = row["demonstration"], row["method"], row["mse"]
@@ -235,6 +237,7 @@ def layer_goals(rows: pd.DataFrame) -> list[Goal]:
 
 
 def summarize(rows: pd.DataFrame, best: dict[str, tuple[float, float]], seconds: dict[bool, float]) -> str:
+    """Every table, as Markdown; ``best`` is {spiral: (floor of sampling, mean of those joined)}."""
     parts = ["# The ideas on and off", "## Must reach", report.goal_table(judge(rows, seconds))]
     for family in FAMILIES:
         if not (members := rows[rows["family"] == family]).empty:
@@ -304,16 +307,17 @@ def contraction(rows: pd.DataFrame) -> str:
 
 
 def each_shape(rows: pd.DataFrame) -> str:
-    one, six = rows[(rows["family"] == LASA) & (rows["method"] == "TubeDS")], rows[rows["family"] == LASA_SIX]
+    """A line per shape of handwriting: shown its first demonstration, and shown six of the seven."""
+    first, six = rows[(rows["family"] == LASA) & (rows["method"] == "TubeDS")], rows[rows["family"] == LASA_SIX]
     lines = []
-    for name, scored in one.groupby("demonstration", sort=False):
+    for name, scored in first.groupby("demonstration", sort=False):
         at = scored[scored["start"] == 0].iloc[0]
         seventh = six[six["demonstration"] == name]["share"]
         numbers = [at["share"], scored[scored["start"] > 0]["share"].mean(), seventh.mean(), seventh.max()]
         lines.append([str(name), *(f"{x:.4f}" for x in numbers), f"{at['condition_path']:.3g}", at["homotopy"]])
-    at, off = one[one["start"] == 0]["share"], one[one["start"] > 0]["share"]
+    at, off = first[first["start"] == 0]["share"], first[first["start"] > 0]["share"]
     means = [f"{x:.4f}" for x in (at.mean(), off.mean(), six["share"].mean(), six["share"].max())]
-    lines.append(["**mean**, worst of six shown", *means, f"{one['condition_path'].max():.3g}", ""])
+    lines.append(["**mean**, worst of six shown", *means, f"{first['condition_path'].max():.3g}", ""])
     head = ("shape", "shown start", "other six starts", "six shown, seventh's start", "worst", "cond(J)", "homotopy")
     return report.table(head, lines)
 

@@ -27,13 +27,15 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.markdown import Markdown
 from scipy.integrate import solve_ivp
+from scipy.optimize import minimize_scalar
 from torch import Tensor, nn
 
 from baselines import SDSEF
-from experiments import deployed, loops, report
+from experiments import deployed, report
 from experiments.report import Goal, at_most
 from latentds import ChebyshevDS, TubeDS, datasets, kernels
 from latentds.arguments import Array
+from latentds.diffeomorphism import WIDTH_BOUND
 from latentds.fitting.matching import match
 from latentds.kernels.compiling import OPTIONS
 from latentds.kernels.dispatch import BLOCK, reference
@@ -68,6 +70,79 @@ def products(buffer: Array, repeats: int) -> None:
 def operations(dim: int) -> int:
     """Vector operations of a layer beside its exponential: x - c, the squared length, times ρ², and x + k v."""
     return dim + dim + 1 + dim
+
+
+# --- the calls as one writes them first, in loops of torch ------------------------------------------------------------
+
+Layers = list[tuple[Tensor, Tensor, Tensor]]
+"""(c, v, ρ) of each."""
+
+
+def layers_of(ds: ChebyshevDS) -> Layers:
+    psi = ds.diffeomorphism
+    return list(zip(*(part.detach() for part in (psi.centers, psi.directions, psi.widths)), strict=True))
+
+
+def forward_loop(layers: Layers, x: Tensor) -> Tensor:
+    for c, v, rho in layers:
+        x = x + torch.exp(-(rho**2) * ((x - c) ** 2).sum(-1, keepdim=True)) * v
+    return x
+
+
+def inverse_loop(layers: Layers, y: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+    """x, and the gradient of each layer's weight with its direction, last layer first."""
+    steps = []
+    for c, v, rho in reversed(layers):
+        w = y - c
+        a, b, r = v @ v, (w * v).sum(-1, keepdim=True), (w * w).sum(-1, keepdim=True)
+        low, high, s = torch.zeros_like(b), torch.ones_like(b), torch.exp(-(rho**2) * r)
+        for _ in range(60):
+            k = torch.exp(-(rho**2) * (a * s * s - 2 * b * s + r))
+            gap = s - k
+            low, high = torch.where(gap < 0, s, low), torch.where(gap > 0, s, high)
+            new = s - gap / (1 - 2 * rho**2 * (b - a * s) * k)
+            new = torch.where((new < low) | (new > high), (low + high) / 2, new)
+            moved, s = (new - s).abs().max(), new
+            if moved < 1e-15:
+                break
+        y = y - s * v
+        steps.append((-2 * rho**2 * s * (y - c), v))
+    return y, steps
+
+
+def velocity_loop(layers: Layers, y: Tensor, latent_velocity: Callable[[Tensor], Tensor]) -> Tensor:
+    x, steps = inverse_loop(layers, y)
+    moved = latent_velocity(x)
+    for gradient, v in reversed(steps):
+        moved = moved + (gradient * moved).sum(-1, keepdim=True) * v
+    return moved
+
+
+def runge_kutta(field: Callable[[Tensor], Tensor], y: Tensor, times: Tensor) -> Tensor:
+    path = [y]
+    for h in times.diff():
+        k1 = field(y)
+        k2 = field(y + h / 2 * k1)
+        k3 = field(y + h / 2 * k2)
+        k4 = field(y + h * k3)
+        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        path.append(y)
+    return torch.stack(path, dim=-2)
+
+
+def match_loop(x: Array, y: Array, n_layers: int, beta: float, mu: float) -> float:
+    """Greedy matching, one bounded scalar minimisation a layer; the mean squared error that it reaches."""
+    for _ in range(n_layers):
+        error = y - x
+        worst = int((error**2).sum(1).argmax())
+        v, squared = beta * error[worst], ((x - x[worst]) ** 2).sum(1)
+
+        def loss(rho: float, v: Array = v, squared: Array = squared, error: Array = error) -> float:
+            return float(((error - np.exp(-(rho**2) * squared)[:, None] * v) ** 2).sum())
+
+        rho = minimize_scalar(loss, bounds=(0, mu * WIDTH_BOUND / np.linalg.norm(v)), method="bounded").x
+        x = x + np.exp(-(rho**2) * squared)[:, None] * v
+    return float(((x - y) ** 2).mean())
 
 
 # --- timing -----------------------------------------------------------------------------------------------------------
@@ -108,7 +183,7 @@ def latent_points(ds: ChebyshevDS, count: int, seed: int = 0) -> Tensor:
 
 
 def against_floor(ds: ChebyshevDS, rounds: int) -> list[Goal]:
-    layers, x = loops.layers_of(ds), latent_points(ds, 100_000)
+    layers, x = layers_of(ds), latent_points(ds, 100_000)
     buffer, repeats = np.full(BLOCK, 0.5), 20_000
     floors = {"exponentials": partial(exponentials, buffer, repeats), "products": partial(products, buffer, repeats)}
     times = take_turns({"decode": partial(ds.decode, x), **floors}, rounds)
@@ -120,19 +195,22 @@ def against_floor(ds: ChebyshevDS, rounds: int) -> list[Goal]:
         f"{np.median(each_exp) * 1e9:.2f} ns, {operations(3)} operations of {np.median(each_product) * 1e9:.3f} ns"
     )
     above = report.median("decode 10⁵ points", "times the floor", 2.5, times["decode"] / floor, at_most=True, note=note)
-    loop = partial(loops.forward, layers, x)
+    loop = partial(forward_loop, layers, x)
     return [above, race("decode 10⁵ points, torch loop", 35, loop, partial(ds.decode, x), max(3, rounds // 4))]
 
 
 def against_loop(ds: ChebyshevDS, rounds: int) -> list[Goal]:
-    layers, many = loops.layers_of(ds), ds.decode(latent_points(ds, 1000))
+    layers, many = layers_of(ds), ds.decode(latent_points(ds, 1000))
 
     def latent_velocity(x: Tensor) -> Tensor:
         return ds.dynamics(x, x, ds.frame())
 
-    one, goals = SHOWN.positions[400], []
-    for label, points, least in (("velocity of 1000 points", many, 80), ("velocity of one point, ds(y)", one, 100)):
-        fast, slow = partial(ds, points), partial(loops.velocity, layers, points, latent_velocity)
+    single, goals = SHOWN.positions[400], []
+    for label, points, least in (
+        ("velocity of 1000 points", many, 80),
+        ("velocity of one point, ds(y)", single, 100),
+    ):
+        fast, slow = partial(ds, points), partial(velocity_loop, layers, points, latent_velocity)
         torch.testing.assert_close(fast(), slow(), rtol=1e-8, atol=1e-8)
         goals.append(race(f"{label}, torch loop", least, slow, fast, rounds))
     return goals
@@ -163,7 +241,7 @@ def rollouts(ds: ChebyshevDS, rounds: int) -> list[Goal]:
     generator = torch.Generator().manual_seed(0)
     starts = SHOWN.start + 0.1 * torch.randn(16, 3, generator=generator, dtype=torch.float64)
     times = torch.linspace(0, SHOWN.duration, 1000, dtype=torch.float64)
-    fast, slow = partial(ds.rollout, starts, times), partial(loops.runge_kutta, ds, starts, times)
+    fast, slow = partial(ds.rollout, starts, times), partial(runge_kutta, ds, starts, times)
     clock = take_turns({"fast": fast, "rk4": slow}, max(3, rounds // 4))
     controller = ds.controller()
 
@@ -212,7 +290,7 @@ def gradients(rounds: int) -> list[Goal]:
 
 def fits(rounds: int) -> list[Goal]:
     x, y = ChebyshevDS.latent_line(SHOWN), SHOWN.positions.numpy()
-    fast, slow = partial(match, x, y, 300, 0.5, 0.9), partial(loops.match, x, y, 300, 0.5, 0.9)
+    fast, slow = partial(match, x, y, 300, 0.5, 0.9), partial(match_loop, x, y, 300, 0.5, 0.9)
     psi = ChebyshevDS(3, n_layers=300).diffeomorphism
     psi.assign(*(torch.from_numpy(part) for part in fast()))
     error = float((psi(torch.from_numpy(x)) - SHOWN.positions).square().mean())

@@ -45,8 +45,8 @@ def learn(quick: bool, seed: int, folder: Path) -> Learned:
     draw = torch.Generator().manual_seed(seed + 1)
     cups = places(200, draw)
     with torch.no_grad():
-        found = paths(pictures(cups, draw), torch.linspace(0, shown.duration, 101))
-        passed = found[:, round(WHEN * (found.shape[1] - 1))] - middle
+        moved = paths(pictures(cups, draw), torch.linspace(0, shown.duration, 101))
+        passed = moved[:, round(WHEN * (moved.shape[1] - 1))] - middle
         ignored = ds.rollout(shown.start, met)[-1] - middle
     numbers = {
         "first loss": history[0],
@@ -56,7 +56,7 @@ def learn(quick: bool, seed: int, folder: Path) -> Learned:
         "distance that the noise alone costs": rms_by_noise(cups),
     }
     notes = f"Root mean squares over {len(cups)} cups, each seen once. The motion itself was not trained."
-    return Learned(history, numbers, notes, draw_cups(found, passed, cups, middle))
+    return Learned(history, numbers, notes, draw_cups(moved, passed, cups, middle))
 
 
 def small_network(inputs: int, outputs: int, seed: int) -> nn.Module:

@@ -83,7 +83,7 @@ def draw_densities(gaussian: Distribution, density: Distribution, points: Tensor
     figure = Figure(figsize=(8.6, 4.4), dpi=plotting.DPI, layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     with torch.no_grad():
-        shades = [one.log_prob(where).exp() for one in (gaussian, density)]
+        shades = [p.log_prob(where).exp() for p in (gaussian, density)]
     for axes, shade, title in zip(panels, shades, ("fitted Gaussian", "learned density"), strict=True):
         image = axes.pcolormesh(
             *where.numpy().transpose(2, 0, 1), shade.numpy(), cmap="cividis", vmin=0, vmax=float(shades[1].max())
