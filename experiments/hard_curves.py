@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -58,10 +59,8 @@ class Curve(NamedTuple):
 def curves(seed: int = 0) -> Iterator[Curve]:
     """All of them, in the same order for the same seed; the seed draws noise, planes and random curves."""
     draw = np.random.default_rng(seed)
-    for name, path in _paths(draw):
-        yield Curve(_shown(path, name), _shown(path, name))
-    for name, path, spoiled in _spoiled(draw):
-        yield Curve(_shown(spoiled, name), _shown(path, name))
+    for name, path, recorded in chain(((name, path, path) for name, path in _paths(draw)), _spoiled(draw)):
+        yield Curve(_shown(recorded, name), _shown(path, name))
 
 
 def _shown(path: Array, name: str) -> Demonstration:

@@ -72,11 +72,7 @@ def planes(study: Study, document: Document) -> None:
 
 
 def draw_planes(motions: Sequence[Demonstration], fitted: Mapping[str, Mapping[str, StableDS]]) -> Figure:
-    """A row per planar motion: rollouts and streamlines of each method side by side.
-
-    Args:
-        fitted: {motion: {method: system}}.
-    """
+    """A row per planar motion: rollouts and streamlines side by side, of {motion: {method: system}}."""
     methods = list(fitted[motions[0].name])
     shape = len(motions), 2 * len(methods)
     figure = Figure(figsize=(3.4 * shape[1], 3.3 * shape[0]), dpi=DPI, layout="constrained")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cache, partial
 
 import numpy as np
@@ -162,12 +161,8 @@ def replications(study: Study, document: Document) -> None:
     document.find(what, "figures", "drawn; judged by DTW", NO_NUMBERS)
 
 
-def draw_bars(scores: Mapping[str, Mapping[str, Array]], title: str) -> Figure:
-    """Mean and standard deviation over the starts, every spiral's scores divided by the largest of its means.
-
-    Args:
-        scores: {spiral: {method: scores of the starts}}.
-    """
+def draw_bars(scores: Scores, title: str) -> Figure:
+    """Mean and standard deviation over the starts, every spiral's scores divided by the largest of its means."""
     methods = list(dict.fromkeys(method for of in scores.values() for method in of))
     figure = Figure(figsize=(2.5 + 1.0 * len(scores), 4.2), dpi=DPI, layout="constrained")
     axes = figure.add_subplot()

@@ -57,7 +57,8 @@ def run(script: Script, quick: bool, seed: int, out: Path) -> Learned:
 
 def summary(learned: Learned) -> str:
     steps = [f"{len(learned.history)} steps", ""]
-    rows = [[what, f"{value:.3g}"] for what, value in learned.numbers.items()]
+    numbers = {"first loss": learned.history[0], "last loss": learned.history[-1], **learned.numbers}
+    rows = [[what, f"{value:.3g}"] for what, value in numbers.items()]
     return f"{report.table(steps, rows)}\n\n{learned.notes}\n"
 
 

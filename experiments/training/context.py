@@ -49,8 +49,6 @@ def learn(quick: bool, seed: int, folder: Path) -> Learned:
         passed = moved[:, round(WHEN * (moved.shape[1] - 1))] - middle
         ignored = ds.rollout(shown.start, met)[-1] - middle
     numbers = {
-        "first loss": history[0],
-        "last loss": history[-1],
         "held-out distance from the cup, goal as demonstrated": rms(ignored - cups),
         "held-out distance from the cup, goal by the network": rms(passed - cups),
         "distance that the noise alone costs": rms_by_noise(cups),

@@ -31,8 +31,6 @@ def learn(quick: bool, seed: int, folder: Path) -> Learned:
     history = Loop("density", 100 if quick else 800, 2e-2, seed, folder / "checkpoint.pt").run(psi, loss)
     with torch.no_grad():
         numbers = {
-            "first loss": history[0],
-            "last loss": history[-1],
             "held-out log-likelihood, fitted Gaussian": float(gaussian.log_prob(held_out).mean()),
             "held-out log-likelihood, learned density": float(density.log_prob(held_out).mean()),
             "held-out log-likelihood, the true density": float(true_log_prob(held_out).mean()),

@@ -47,8 +47,6 @@ def learn(quick: bool, seed: int, folder: Path) -> Learned:
     before, after = (motions(system, held_out, shown) for system in (fitted, ds))
     certificate = certify(ds)
     numbers = {
-        "first loss": history[0],
-        "last loss": history[-1],
         "largest distance from the via-point, fitted": float(miss(before).max()),
         "largest distance from the via-point, trained": float(miss(after).max()),
         "least clearance of the sphere, fitted": float(clearance(before).min()),
