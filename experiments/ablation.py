@@ -10,8 +10,9 @@ goes on where it was interrupted.
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -21,32 +22,33 @@ import numpy as np
 import pandas as pd
 import torch
 import typer
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.markdown import Markdown
 
-from experiments import figures, floor, goals, report
-from experiments.goals import Goal, at_most
-from experiments.methods import GREEDY, greedy, setting
-from experiments.motions import handwriting, recordings, spirals
+from experiments import report
+from experiments.compared import GREEDY, greedy, handwriting, recordings, setting, spirals
 from experiments.published import TABLE_ONE
-from latentds import Demonstration, TubeDS, datasets
+from experiments.report import Goal, at_most
+from latentds import Demonstration, TubeDS, datasets, metrics, plotting
+from latentds.arguments import Array
 from latentds.base import LatentDS
 from latentds.benchmark import Cell, Factory, Paths, RolloutProtocol, run, table
 from latentds.fitting.matching import PINS
 
 PROTOCOL = RolloutProtocol()
-MANY = RolloutProtocol(n_starts=200)
+MORE_STARTS = RolloutProtocol(n_starts=200)
 """On each spiral for TubeDS alone: over 20 starts a mean is still a matter of chance."""
-NEAR = 0.05
+BALL_RADIUS = 0.05
 """Radius of the ball of starts around a recording's start, in sizes of the motion; 0.1 on the spirals' sphere."""
 KAPPAS = (0.5, 5.0, 80.0)
 """Beside the default, 20; the first is as good as none. Refinement moves the scores of off-path starts little."""
-CHOSEN = (
+TRIED_EVERYWHERE = (
     "Chebyshev", "Chebyshev + both", "FDM", "FDM + both",
     "TubeDS, straight alone", "TubeDS, unbending alone", "TubeDS, not refined", "TubeDS",
 )  # fmt: skip
 """Tried on every motion; the others on the spirals alone."""
-LASA, SIX, MORE, LAYERS = "LASA", "LASA, six shown", "more starts", "layers"
+LASA, LASA_SIX, MORE, HALF_LAYERS = "LASA", "LASA, six shown", "more starts", "layers"
 FAMILIES = ("unstable", "stable", LASA, "recordings")
 
 
@@ -101,28 +103,21 @@ def parts(
     for family in ("unstable", "stable"):
         mine = [d for d in shown if d.name.startswith(f"{family} ")]
         yield Part(family, PROTOCOL, [cell(label, f, d) for d in mine for label, f in variants(d.name).items()])
-    yield Part(MORE, MANY, [cell(f"TubeDS, {MANY.n_starts} starts", TubeDS, d) for d in shown])
+    yield Part(MORE, MORE_STARTS, [cell(f"TubeDS, {MORE_STARTS.n_starts} starts", TubeDS, d) for d in shown])
     layers = [(label, d) for d in shown for label in GREEDY if d.name in TABLE_ONE[label]]
-    yield Part(LAYERS, PROTOCOL, [cell(label, half_the_layers(label, d.name), d) for label, d in layers])
+    yield Part(HALF_LAYERS, PROTOCOL, [cell(label, half_the_layers(label, d.name), d) for label, d in layers])
     for d in recorded:
-        near = RolloutProtocol(n_starts=6, radius=NEAR * d.size)
-        yield Part("recordings", near, [cell(label, variants(d.name)[label], d) for label in CHOSEN])
+        near = RolloutProtocol(n_starts=6, radius=BALL_RADIUS * d.size)
+        yield Part("recordings", near, [cell(label, variants(d.name)[label], d) for label in TRIED_EVERYWHERE])
     # Each is shown the first and judged by all, or shown six and judged by the seventh, from where those start.
     theirs, seven = RolloutProtocol(n_starts=0), written.items()
-    ones = [cell(label, variants(name)[label], d[0], d) for name, d in seven for label in CHOSEN]
-    sixes = [cell(f"TubeDS without {i + 1}", TubeDS, d[:i] + d[i + 1 :], d[i]) for _, d in seven for i in (0, 3, 6)]
+    ones = [cell(label, variants(name)[label], d[0], judges=d) for name, d in seven for label in TRIED_EVERYWHERE]
+    sixes = [
+        cell(f"TubeDS without {i + 1}", TubeDS, d[:i] + d[i + 1 :], judges=d[i]) for _, d in seven for i in (0, 3, 6)
+    ]
     if written:
         yield Part(LASA, theirs, ones)
-        yield Part(SIX, theirs, sixes)
-
-
-def cell(
-    label: str,
-    factory: Factory,
-    shown: Demonstration | Sequence[Demonstration],
-    judges: Demonstration | Sequence[Demonstration] | None = None,
-) -> Cell:
-    return Cell(label, factory, shown, judges=judges, measure=costs)
+        yield Part(LASA_SIX, theirs, sixes)
 
 
 def costs(ds: LatentDS, cell: Cell) -> dict[str, Any]:
@@ -131,9 +126,12 @@ def costs(ds: LatentDS, cell: Cell) -> dict[str, Any]:
     with torch.no_grad():
         condition = float(ds.condition_number(ds.encode(shown.positions)).max())
         exact = bool((ds.attractor - shown.goal).abs().max() <= 1e-9 * shown.size)
-    names = ("isotopy", "condition_path", "condition_tube", "largest_velocity", "largest_gradient")
+    names = ("homotopy", "condition_path", "condition_tube", "largest_velocity", "largest_gradient")
     reported = {name: value for name, value in vars(ds.fit_report).items() if name in names}
     return {"condition_path": condition, "attractor_exact": exact} | reported
+
+
+cell = partial(Cell, measure=costs)
 
 
 def results(part: Part, jobs: int, store: Path, paths: Paths) -> pd.DataFrame:
@@ -156,10 +154,42 @@ def fit_seconds(refined: bool) -> float:
     return float(np.median(seconds))
 
 
+def sampling_floor(shown: Demonstration, protocol: RolloutProtocol, count: int = 100) -> float:
+    """Mean exact DTW between the sampled demonstration and itself, late by a fraction of a sample, even over [0, 1).
+
+    Off the demonstrated start nobody knows the clock: even a rollout without any error is late by some such fraction.
+    """
+    times, reference = protocol.times(shown).numpy(), protocol.reference(shown)
+    late = (np.arange(count) + 0.5) / count * (times[1] - times[0])
+    return float(np.mean([metrics.dtw(shown.at(times + seconds), reference) for seconds in late]))
+
+
+def joined_floor(shown: Demonstration, protocol: RolloutProtocol, starts: Array, kappa: float = 20.0) -> list[float]:
+    """Exact DTW of the demonstration itself, joined from each start (n,) at its nearest point.
+
+    The way there shrinks at ``kappa``, as in a tube without any error; a start behind the first point is late.
+    """
+    times, reference = protocol.times(shown).numpy(), protocol.reference(shown)
+    fine = np.linspace(0, shown.duration, 20_001)
+    path = shown.at(fine)
+    speed, scores = (path[1] - path[0]) / fine[1], []
+    for start in starts:
+        nearest = int(np.linalg.norm(path - start, axis=1).argmin())
+        away, late = start - path[nearest], 0.0
+        if nearest == 0:
+            late = -float(away @ speed / (speed @ speed))
+        clocks = times + fine[nearest] - late
+        motion = shown.at(clocks) + np.minimum(clocks, 0)[:, None] * speed
+        motion += np.exp(-kappa * times / shown.duration)[:, None] * (away + late * speed)
+        scores.append(metrics.dtw(motion, reference))
+    return scores
+
+
 # --- what came of it --------------------------------------------------------------------------------------------------
 
 
 def judge(rows: pd.DataFrame, seconds: dict[bool, float]) -> list[Goal]:
+    """The goals; ``seconds`` is {refined: of a fit}."""
     ours = rows[rows["method"] == "TubeDS"]
     sphere = ours[ours["family"].isin(("unstable", "stable"))]
     near = sphere[sphere["start"] > 0].groupby("demonstration", sort=False)["dtw"]
@@ -168,7 +198,7 @@ def judge(rows: pd.DataFrame, seconds: dict[bool, float]) -> list[Goal]:
     gain = gain[[name for name in gain.index if name == "unstable c=7" or name.startswith("stable")]]
     first = ours[ours["start"] == 0].set_index("demonstration")
     drawn, joints = first[first["family"] == LASA], first[(first["family"] == "recordings") & (first["dim"] == 7)]
-    six = rows[rows["family"] == SIX]["share"]
+    six = rows[rows["family"] == LASA_SIX]["share"]
     low, exact = gain[~(gain >= 3)], bool(first["attractor_exact"].eq(True).all())
     reached = [
         at_most("spirals: exact DTW from the demonstrated start", first.loc[list(near.groups), "dtw"], 3),
@@ -189,13 +219,14 @@ def judge(rows: pd.DataFrame, seconds: dict[bool, float]) -> list[Goal]:
     ]
     for refined, bound in ((False, 1), (True, 10)):
         name = f"fit of 150 layers to 1000 points, refinement {'on' if refined else 'off'}"
-        reached.append(at_most(name, pd.Series({"": seconds[refined]}), bound, " s"))
+        reached.append(at_most(name, seconds[refined], bound, " s"))
     return reached
 
 
 def layer_goals(rows: pd.DataFrame) -> list[Goal]:
+    """The paper's MSE with half of its layers."""
     listed = []
-    for _, row in rows[(rows["family"] == LAYERS) & (rows["start"] == 0)].iterrows():
+    for _, row in rows[(rows["family"] == HALF_LAYERS) & (rows["start"] == 0)].iterrows():
         name, label, reached = row["demonstration"], row["method"], row["mse"]
         paper = TABLE_ONE[label][name]
         hoped = name in ("unstable c=7", "unstable c=10", "unstable c=15")
@@ -206,7 +237,8 @@ def layer_goals(rows: pd.DataFrame) -> list[Goal]:
 
 
 def summarize(rows: pd.DataFrame, best: dict[str, tuple[float, float]], seconds: dict[bool, float]) -> str:
-    parts = ["# The ideas on and off", "## Must reach", goals.table(judge(rows, seconds))]
+    """Every table, as Markdown; ``best`` is {spiral: (floor of sampling, mean of those joined)}."""
+    parts = ["# The ideas on and off", "## Must reach", report.goal_table(judge(rows, seconds))]
     for family in FAMILIES:
         if not (members := rows[rows["family"] == family]).empty:
             unit = "exact DTW" if family in ("unstable", "stable") else "DTW/500 in sizes of the motion"
@@ -214,14 +246,12 @@ def summarize(rows: pd.DataFrame, best: dict[str, tuple[float, float]], seconds:
             parts += [f"## {family.capitalize() if family != LASA else LASA}: {unit}, {count} motions", ideas(members)]
     parts += ["## TubeDS on each spiral: exact DTW", each_spiral(rows, best), FLOOR]
     parts += ["## What the contraction κ costs and buys", contraction(rows)]
-    if (rows["family"] == SIX).any():
+    if (rows["family"] == LASA_SIX).any():
         parts += ["## LASA, shape by shape: DTW/500 in sizes of the motion", each_shape(rows)]
     if (bad := rows[rows["error"] != ""]).any(axis=None):
         counts = bad.groupby(["demonstration", "method", "error"], sort=False).size()
-        parts += [
-            "## Failures",
-            report.table(("motion", "method", "error", "rows"), [[*k, str(n)] for k, n in counts.items()]),
-        ]
+        lines = [[*key, str(count)] for key, count in counts.items()]
+        parts += ["## Failures", report.table(("motion", "method", "error", "rows"), lines)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -248,16 +278,16 @@ def ideas(rows: pd.DataFrame) -> str:
 
 def each_spiral(rows: pd.DataFrame, best: dict[str, tuple[float, float]]) -> str:
     lines = []
-    for name, (least, tube_alone) in best.items():
-        of = rows[(rows["demonstration"] == name) & (rows["family"] != LAYERS)]
+    for name, (floor, joined) in best.items():
+        of = rows[(rows["demonstration"] == name) & (rows["family"] != HALF_LAYERS)]
         dtw = {label: mine.set_index("start")["dtw"] for label, mine in of.groupby("method")}
-        twenty, many = dtw["TubeDS"].drop(0), dtw[f"TubeDS, {MANY.n_starts} starts"].drop(0)
+        twenty, many = dtw["TubeDS"].drop(0), dtw[f"TubeDS, {MORE_STARTS.n_starts} starts"].drop(0)
         rivals = [dtw[label].drop(0).mean() for label in GREEDY]
-        numbers = [dtw["TubeDS"][0], twenty.mean(), twenty.max(), many.mean(), many.max(), tube_alone, least, *rivals]
-        isotopy = of[of["method"] == "TubeDS"]["isotopy"].iloc[0]
-        lines.append([name, *(f"{number:.2f}" for number in numbers), isotopy])
-    ours = ("shown start", "20 starts, mean", "worst", f"{MANY.n_starts} starts, mean", "worst", "joined", "floor")
-    return report.table(("spiral", *ours, "Chebyshev, 20", "FDM, 20", "isotopy"), lines)
+        numbers = [dtw["TubeDS"][0], twenty.mean(), twenty.max(), many.mean(), many.max(), joined, floor, *rivals]
+        homotopy = of[of["method"] == "TubeDS"]["homotopy"].iloc[0]
+        lines.append([name, *(f"{number:.2f}" for number in numbers), homotopy])
+    many_starts = (f"{MORE_STARTS.n_starts} starts, mean", "worst", "joined", "floor", "Chebyshev, 20", "FDM, 20")
+    return report.table(("spiral", "shown start", "20 starts, mean", "worst", *many_starts, "homotopy"), lines)
 
 
 def contraction(rows: pd.DataFrame) -> str:
@@ -277,18 +307,64 @@ def contraction(rows: pd.DataFrame) -> str:
 
 
 def each_shape(rows: pd.DataFrame) -> str:
-    one, six = rows[(rows["family"] == LASA) & (rows["method"] == "TubeDS")], rows[rows["family"] == SIX]
+    """A line per shape of handwriting: shown its first demonstration, and shown six of the seven."""
+    first, six = rows[(rows["family"] == LASA) & (rows["method"] == "TubeDS")], rows[rows["family"] == LASA_SIX]
     lines = []
-    for name, scored in one.groupby("demonstration", sort=False):
+    for name, scored in first.groupby("demonstration", sort=False):
         at = scored[scored["start"] == 0].iloc[0]
         seventh = six[six["demonstration"] == name]["share"]
         numbers = [at["share"], scored[scored["start"] > 0]["share"].mean(), seventh.mean(), seventh.max()]
-        lines.append([str(name), *(f"{x:.4f}" for x in numbers), f"{at['condition_path']:.3g}", at["isotopy"]])
-    at, off = one[one["start"] == 0]["share"], one[one["start"] > 0]["share"]
+        lines.append([str(name), *(f"{x:.4f}" for x in numbers), f"{at['condition_path']:.3g}", at["homotopy"]])
+    at, off = first[first["start"] == 0]["share"], first[first["start"] > 0]["share"]
     means = [f"{x:.4f}" for x in (at.mean(), off.mean(), six["share"].mean(), six["share"].max())]
-    lines.append(["**mean**, worst of six shown", *means, f"{one['condition_path'].max():.3g}", ""])
-    head = ("shape", "shown start", "other six starts", "six shown, seventh's start", "worst", "cond(J)", "isotopy")
+    lines.append(["**mean**, worst of six shown", *means, f"{first['condition_path'].max():.3g}", ""])
+    head = ("shape", "shown start", "other six starts", "six shown, seventh's start", "worst", "cond(J)", "homotopy")
     return report.table(head, lines)
+
+
+def draw_gains(rows: pd.DataFrame, families: Sequence[str]) -> Figure:
+    """Mean score of every method on every family, from the demonstrated start and from the others."""
+    families = [family for family in families if (rows["family"] == family).any()]
+    labels = list(rows[rows["family"].isin(families)]["method"].unique())
+    figure = Figure(figsize=(3.2 * len(families) + 2, 5.2), dpi=plotting.DPI, layout="constrained")
+    panels = figure.subplots(1, len(families), sharey=True, squeeze=False)[0]
+    place = -np.arange(len(labels))
+    for axes, family in zip(panels, families, strict=True):
+        members = rows[rows["family"] == family]
+        for part, colour, shift, name in (
+            (members[members["start"] > 0], plotting.COLORS["Chebyshev"], 0.19, "other starts"),
+            (members[members["start"] == 0], plotting.COLORS["FDM"], -0.19, "demonstrated start"),
+        ):
+            means = part.groupby("method")["share"].mean().reindex(labels)
+            axes.barh(place + shift, means, 0.36, color=colour, label=name)
+        axes.set(xscale="log", xlim=(5e-5, 1), title=family, xlabel="DTW/500 [sizes of the motion]")
+        axes.set_yticks(place, labels)
+        report.plain(axes, "x")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+    return figure
+
+
+def draw_handwriting(shapes: Mapping[str, tuple[Sequence[Demonstration], Array]]) -> Figure:
+    """Every shape: what was shown, the rollout from its start, and those from the other demonstrations' starts."""
+    columns = 6 if len(shapes) > 4 else len(shapes)
+    height = math.ceil(len(shapes) / columns)
+    figure = Figure(figsize=(2.1 * columns, 2.2 * height + 0.4), dpi=plotting.DPI, layout="constrained")
+    panels = figure.subplots(height, columns, squeeze=False).ravel()
+    for axes in panels[len(shapes) :]:
+        axes.set_axis_off()
+    for axes, (name, (written, paths)) in zip(panels, shapes.items(), strict=False):
+        for i, path in enumerate(paths[1:]):
+            axes.plot(*path.T, color="#56B4E9", lw=0.8, label="" if i else "from the other six starts")
+            axes.plot(*path[0], ".", color="#0072B2", ms=4)
+        axes.plot(*paths[0].T, color=plotting.COLORS["TubeDS"], lw=2.2, label="from the demonstrated start")
+        axes.plot(*written[0].positions.T, "--", color=plotting.SHOWN, lw=0.9, label="demonstration")
+        axes.plot(*written[0].goal, "*", color="#E69F00", mec=plotting.SHOWN, mew=0.5, ms=9)
+        axes.set_title(name, fontsize=9)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.set(xticks=[], yticks=[])
+        axes.spines[:].set_color("#CCCCCC")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    return figure
 
 
 def main(
@@ -299,10 +375,7 @@ def main(
 ) -> None:
     """Turn the ideas of TubeDS on and off."""
     began, console = time.perf_counter(), Console()
-    try:
-        recorded = recordings(data or [])
-    except (ValueError, FileNotFoundError) as error:
-        raise typer.BadParameter(str(error)) from None
+    recorded = recordings(data or [])
     shown, written = spirals(quick), dict(list(handwriting().items())[:: 9 if quick else 1])
     if not written:
         console.print("LASA handwriting is not installed and left out: run `make lasa` once.")
@@ -310,19 +383,16 @@ def main(
     out.mkdir(parents=True, exist_ok=True)
     tables: list[pd.DataFrame] = []
     shapes: dict[str, Any] = {}
-    try:
+    with report.interruptible(console):
         for part in parts(shown, recorded or stand_ins, written):
             console.print(f"{part.family}: {len(part.cells)} fits")
             paths: Paths = {}
             tables.append(results(part, jobs, out / "cells.sqlite", paths))
             if part.family == LASA:
                 shapes |= {c.demonstration: (c.judges, paths[c.name]) for c in part.cells if c.method == "TubeDS"}
-    except KeyboardInterrupt:
-        console.print("Interrupted; the same command goes on from here.")
-        raise typer.Exit(130) from None
     rows = pd.concat(tables, ignore_index=True)
-    many = {d.name: floor.joined(d, MANY, MANY.starts(d)[1:].numpy()) for d in shown}
-    best = {d.name: (floor.sampled(d, MANY), float(np.mean(many[d.name]))) for d in shown}
+    many = {d.name: joined_floor(d, MORE_STARTS, MORE_STARTS.starts(d)[1:].numpy()) for d in shown}
+    best = {d.name: (sampling_floor(d, MORE_STARTS), float(np.mean(many[d.name]))) for d in shown}
     summary = summarize(rows, best, {refined: fit_seconds(refined) for refined in (False, True)})
     took = time.perf_counter() - began
     settings = {"command": {"quick": quick, "jobs": jobs, "recordings": len(recorded), "seconds": round(took, 1)}}
@@ -330,9 +400,9 @@ def main(
     report.write(out / "rows.csv", rows.to_csv(index=False))
     report.write(out / "settings.json", settings)
     report.write(out / "summary.md", summary)
-    figures.gains(rows, FAMILIES).savefig(out / "gains.png")
+    draw_gains(rows, FAMILIES).savefig(out / "gains.png")
     if shapes:
-        figures.handwriting(shapes).savefig(out / "lasa.png")
+        draw_handwriting(shapes).savefig(out / "lasa.png")
     console.print(Markdown(summary))
     console.print(f"{out}: rows.csv, summary.md, settings.json and pictures, after {took:.0f} s")
 

@@ -21,18 +21,16 @@ from typing import Any, TypeVar
 
 import numpy as np
 import onnxruntime
-import pandas as pd
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from experiments import goals
-from experiments.goals import Goal
+from experiments import report
+from experiments.report import Goal, at_most
 from latentds import Demonstration, LatentDS, TubeDS, datasets
+from latentds.arguments import Array
 from latentds.deploy import c, onnx
 from latentds.testing import wavy_motion
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 LIMITS = {torch.float64: 1e-12, torch.float32: 1e-5}
@@ -81,15 +79,13 @@ def cpu_seconds() -> float:
     return times.user + times.system + times.children_user + times.children_system
 
 
-def within(what: str, found: Any, ds: LatentDS, y: Tensor, bound: float) -> Goal:
+def within(what: str, velocity: Any, ds: LatentDS, y: Tensor, bound: float) -> Goal:
     """That velocities differ from eager torch by no more than ``bound``, in largest speeds."""
     expected = ds(y).double()
-    error = (torch.as_tensor(found).double() - expected).abs().max() / torch.linalg.vector_norm(expected, dim=-1).max()
-    return goals.at_most(f"{what}, distance from eager", pd.Series([float(error)]), bound)._replace(unit="top speed")
-
-
-def seconds(what: str, taken: float, bound: float, note: str = "") -> Goal:
-    return goals.at_most(what, pd.Series([taken]), bound)._replace(unit="s", note=note)
+    error = (torch.as_tensor(velocity).double() - expected).abs().max() / torch.linalg.vector_norm(
+        expected, dim=-1
+    ).max()
+    return at_most(f"{what}, distance from eager", float(error), bound, unit="top speed")
 
 
 def take_turns(compiled: Callable[[Tensor], Tensor], ds: LatentDS, y: Tensor) -> str:
@@ -117,21 +113,21 @@ def in_torch(dim: int, dtype: torch.dtype) -> list[Goal]:
     torch.compiler.reset()
     with torch._inductor.config.patch(force_disable_caches=True):
         compiled, began = torch.compile(ds), cpu_seconds()
-        found, first = timed(lambda: compiled(y))
+        velocity, first = timed(lambda: compiled(y))
         busy = f"{cpu_seconds() - began:.0f} s of CPU time, the C++ compiler's included"
     calls = take_turns(compiled, ds, y)
     note = f"{nodes} nodes, {size(small.graph_module)} at M = 2; a file of {file.getbuffer().nbytes / 1000:.0f} kB"
     return [
-        seconds(f"torch.export, {label}", exported, 30, note),
+        at_most(f"torch.export, {label}", exported, 30, unit="s", note=note),
         within(f"torch.export, {label}", program.module()(y), ds, y, LIMITS[dtype]),
-        seconds(f"torch.compile, {label}, first answer", first, 90, f"{busy}; then {calls}"),
-        within(f"torch.compile, {label}", found, ds, y, LIMITS[dtype]),
+        at_most(f"torch.compile, {label}, first answer", first, 90, unit="s", note=f"{busy}; then {calls}"),
+        within(f"torch.compile, {label}", velocity, ds, y, LIMITS[dtype]),
     ]
 
 
 def in_onnx(calls: int) -> list[Goal]:
     """ONNX in onnxruntime at M = 150."""
-    ds, found = fitted(3, 150), []
+    ds, goals = fitted(3, 150), []
     y = points_near(ds, 1000)
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -145,17 +141,16 @@ def in_onnx(calls: int) -> list[Goal]:
             (velocity,) = session.run(None, {"y": points})
             micro = [1e6 * timed(lambda: session.run(None, {"y": points[:1]}))[1] for _ in range(calls)]  # noqa: B023
             note = f"one point takes onnxruntime {np.median(micro):.0f} µs, worst of {calls}: {max(micro):.0f} µs"
-            kilobytes = goals.at_most(f"{label}, file", pd.Series([path.stat().st_size / 1000]), 100)
-            found += [
-                seconds(f"{label}, written", taken, 10, note),
-                kilobytes._replace(unit="kB"),
+            goals += [
+                at_most(f"{label}, written", taken, 10, unit="s", note=note),
+                at_most(f"{label}, file", path.stat().st_size / 1000, 100, unit="kB"),
                 within(label, velocity, ds, torch.from_numpy(points).double(), bound),
             ]
-    return found
+    return goals
 
 
 def library(ds: LatentDS, folder: str, *, bounded: bool = False) -> ctypes.CDLL:
-    """The header of a system, compiled; ``bounded``: no layer left out, no root found before its last step."""
+    """The header of a system, compiled; ``bounded``: no layer left out, no root goals before its last step."""
     header, built = Path(folder, "field.h"), Path(folder, f"field{bounded:d}.so")
     c.write(ds, header, name="field")
     if bounded:
@@ -177,7 +172,7 @@ def called(program: ctypes.CDLL, y: Array) -> tuple[Array, Array]:
 
 def in_c() -> list[Goal]:
     """The C header beside the controller: the same systems, the same points."""
-    found = []
+    goals = []
     for ds in (fitted(3, 150), fitted(3, 300), fitted(7, 300)):
         y = points_near(ds, 10_000)
         with TemporaryDirectory() as folder:
@@ -186,17 +181,13 @@ def in_c() -> list[Goal]:
         controller, out = ds.controller(), np.empty(ds.dim)
         beside = np.array([1e6 * timed(lambda: controller(at, out), time.thread_time)[1] for at in y.numpy()])  # noqa: B023
         label = f"M = {ds.n_layers}, n = {ds.dim}"
-        for name, taken in (
-            ("C header", header),
-            ("C header, all layers and steps taken", bounded),
-            ("controller(y)", beside),
-        ):
+        calls = {"C header": header, "C header, all layers and steps taken": bounded, "controller(y)": beside}
+        for name, taken in calls.items():
             note = f"median {np.median(taken):.1f} µs, 99th percentile {np.quantile(taken, 0.99):.1f} µs, of CPU time"
-            found.append(
-                Goal(f"{name}, {label}, worst of {len(y)} calls", "", f"{taken.max():.0f}", unit="µs", note=note)
-            )
-        found.append(within(f"C header, {label}, {len(y)} points", velocity, ds, y, 1e-12))
-    return found
+            what = f"{name}, {label}, worst of {len(y)} calls"
+            goals.append(Goal(what, "", f"{taken.max():.0f}", unit="µs", note=note))
+        goals.append(within(f"C header, {label}, {len(y)} points", velocity, ds, y, 1e-12))
+    return goals
 
 
 def measure(quick: bool) -> list[Goal]:
@@ -208,5 +199,5 @@ def measure(quick: bool) -> list[Goal]:
 if __name__ == "__main__":
     torch.set_num_threads(1)
     torch.set_grad_enabled(False)
-    print(goals.table(measure(quick=False)), flush=True)
+    print(report.goal_table(measure(quick=False)), flush=True)
     print(f"\nLoad average at the end: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores.")

@@ -12,6 +12,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -19,19 +20,18 @@ import numpy as np
 import pandas as pd
 import torch
 import typer
-from numpy.typing import NDArray
 
 from experiments import report
 from latentds import Demonstration, FitWarning, TubeDS, datasets, metrics
-from latentds.curves import arc_lengths
+from latentds.arguments import Array
+from latentds.curves import evenly_resampled, extent, interpolated
 from latentds.methods.tube import TubeReport
 
-Array = NDArray[np.float64]
-
-FOLLOWS = 0.01
-"""Largest exact DTW per point, in sizes of the motion."""
-POINTS = 400
+LARGEST_MISS = 0.01
+"""Exact DTW per point, in sizes of the motion, up to which a rollout follows."""
+ROLLOUT_POINTS = 400
 REFUSED = "refused: "
+"""How the note of a curve that no fit takes begins."""
 KINDS = {
     "noise": ("noise",),
     "steps": ("quantised",),
@@ -59,10 +59,8 @@ class Curve(NamedTuple):
 def curves(seed: int = 0) -> Iterator[Curve]:
     """All of them, in the same order for the same seed; the seed draws noise, planes and random curves."""
     draw = np.random.default_rng(seed)
-    for name, path in _paths(draw):
-        yield Curve(_shown(path, name), _shown(path, name))
-    for name, path, spoiled in _spoiled(draw):
-        yield Curve(_shown(spoiled, name), _shown(path, name))
+    for name, path, recorded in chain(((name, path, path) for name, path in _paths(draw)), _spoiled(draw)):
+        yield Curve(_shown(recorded, name), _shown(path, name))
 
 
 def _shown(path: Array, name: str) -> Demonstration:
@@ -75,12 +73,6 @@ def _even(count: int = 1000) -> Array:
 
 def _columns(*columns: Array) -> Array:
     return np.stack(columns, axis=1)
-
-
-def _into(path: Array, dim: int, draw: np.random.Generator) -> Array:
-    """The curve laid into ``dim`` dimensions, in a plane or space drawn at random."""
-    basis = np.linalg.qr(draw.standard_normal((dim, path.shape[1])))[0]
-    return np.asarray(path @ basis.T)
 
 
 def _paths(draw: np.random.Generator) -> Iterator[tuple[str, Array]]:
@@ -97,7 +89,8 @@ def _paths(draw: np.random.Generator) -> Iterator[tuple[str, Array]]:
         angle = 2 * np.pi * (1 - gap) * t
         yield f"circle open by {gap:g}", _columns(np.cos(angle), np.sin(angle))
     angle = 2 * np.pi * 0.99 * t
-    yield "circle open by 0.01, in 7-D", _into(_columns(np.cos(angle), np.sin(angle)), 7, draw)
+    plane = np.linalg.qr(draw.standard_normal((7, 2)))[0]
+    yield "circle open by 0.01, in 7-D", _columns(np.cos(angle), np.sin(angle)) @ plane.T
     for back in (0.5, 0.9, 0.99):
         bend = np.interp(t, [0, 0.45, 0.55, 1], [0, 0, np.pi, np.pi])
         hook = np.cumsum(_columns(np.cos(bend), np.sin(bend)), axis=0)
@@ -107,19 +100,18 @@ def _paths(draw: np.random.Generator) -> Iterator[tuple[str, Array]]:
             radius, angle = 0.05 + 0.95 * t, 2 * np.pi * turns * t
             spiral = _columns(radius * np.cos(angle), radius * np.sin(angle))
             yield f"planar spiral, {turns:g} turns {'in' if inward else 'out'}", spiral[::-1] if inward else spiral
-    yield "planar spiral, 5 turns in, evenly", _even_way(spiral[::-1])
+    yield "planar spiral, 5 turns in, evenly", evenly_resampled(spiral[::-1], len(spiral))
     yield "paper's Archimedean spiral", datasets.archimedean_spiral().positions.numpy()
-    double = np.concatenate([_archimedes(2.5)[:0:-1], -_archimedes(2.5)])
-    yield "planar spiral in and out", double
+    way = _even(600)
+    arm = way[:, None] * _columns(np.cos(5 * np.pi * way), np.sin(5 * np.pi * way))
+    yield "planar spiral in and out", np.concatenate([arm[:0:-1], -arm])
     angle = 2 * np.pi * 0.98 * t
     yield "Lissajous 3:4:5", _columns(np.sin(3 * angle), np.sin(4 * angle + 0.4), np.sin(5 * angle + 1.1))
     yield "Lissajous 5:7:8", _columns(np.cos(5 * angle), np.cos(7 * angle + 0.7), np.cos(8 * angle + 0.2))
     for p, q in ((2, 3), (2, 5), (3, 4)):
         ring = 2 + np.cos(q * angle)
-        yield (
-            f"torus knot {p}, {q}, opened",
-            _columns(ring * np.cos(p * angle), ring * np.sin(p * angle), np.sin(q * angle)),
-        )
+        knot = _columns(ring * np.cos(p * angle), ring * np.sin(p * angle), np.sin(q * angle))
+        yield f"torus knot {p}, {q}, opened", knot
     ring = 2 + np.cos(2 * angle)
     yield "figure-eight knot, opened", _columns(ring * np.cos(3 * angle), ring * np.sin(3 * angle), np.sin(4 * angle))
     for apart in (0.1, 0.02, 0.005):
@@ -132,7 +124,8 @@ def _paths(draw: np.random.Generator) -> Iterator[tuple[str, Array]]:
     yield "sine, 15 periods, in 3-D", _columns(2 * t, 0.3 * np.sin(30 * np.pi * t), 0.3 * np.sin(16 * np.pi * t))
     yield "sine, in 1-D, slowing", 1 - np.square(1 - t)[:, None]
     yield "square wave", _rounded(np.array([[k // 2, (k + 1) // 2 % 2] for k in range(12)], float), 1000, 0.0)
-    yield "loop-the-loop, 1e-2 apart", _loop(t, 0.01)
+    angle = 2 * np.pi * np.clip(3 * t - 1, 0, 1)
+    yield "loop-the-loop, 1e-2 apart", _columns(3 * t + np.sin(angle), 1 - np.cos(angle), 0.01 * t)
     yield "unstable c=15", datasets.unstable_spiral(15).positions.numpy()
     yield "stable c=7", datasets.stable_spiral(7).positions.numpy()
     for dim in (2, 5, 10, 20, 30):
@@ -142,7 +135,8 @@ def _paths(draw: np.random.Generator) -> Iterator[tuple[str, Array]]:
         yield f"{count} points", _random(3, 1, count, draw)
     yield "20 points of a spiral", datasets.unstable_spiral(3, 20).positions.numpy()
     yield "200000 points", datasets.unstable_spiral(3, 200_000).positions.numpy()
-    yield "20000 points, rests", _columns(np.cos(4 * _rests(20_000)), np.sin(4 * _rests(20_000)), _rests(20_000))
+    rests = np.interp(_even(20_000), [0, 0.2, 0.4, 0.6, 0.8, 1], [0, 0, 0.5, 0.5, 1, 1])
+    yield "20000 points, rests", _columns(np.cos(4 * rests), np.sin(4 * rests), rests)
 
 
 def _spoiled(draw: np.random.Generator) -> Iterator[tuple[str, Array, Array]]:
@@ -153,39 +147,22 @@ def _spoiled(draw: np.random.Generator) -> Iterator[tuple[str, Array, Array]]:
     spiral = datasets.unstable_spiral(7).positions.numpy()
     for share in (0.001, 0.01, 0.05):
         for name, path in (("arc", arc), ("wave in 3-D", wave), ("unstable c=7", spiral)):
-            size = np.ptp(path, axis=0).max()
-            yield f"{name}, {share:.1%} noise", path, path + share * size * draw.standard_normal(path.shape)
+            yield f"{name}, {share:.1%} noise", path, path + share * extent(path) * draw.standard_normal(path.shape)
     for share in (0.01, 0.05):
         for name, path in (("arc", arc), ("wave in 3-D", wave)):
-            size = np.ptp(path, axis=0).max()
-            yield f"{name}, quantised to {share:.0%}", path, share * size * np.round(path / (share * size))
-
-
-def _even_way(path: Array) -> Array:
-    arc = arc_lengths(path)
-    return np.stack([np.interp(np.linspace(0, arc[-1], len(path)), arc, column) for column in path.T], axis=1)
-
-
-def _archimedes(turns: float) -> Array:
-    t = _even(600)
-    angle = 2 * np.pi * turns * t
-    return t[:, None] * _columns(np.cos(angle), np.sin(angle))
+            step = share * extent(path)
+            yield f"{name}, quantised to {share:.0%}", path, step * np.round(path / step)
 
 
 def _rounded(knots: Array, count: int, share: float = 0.01) -> Array:
     """Straight from knot to knot, at even speed, with corners rounded over that share of the way."""
-    fine = _even_way(np.stack([np.interp(_even(count), np.linspace(0, 1, len(knots)), c) for c in knots.T], axis=1))
+    fine = evenly_resampled(interpolated(_even(count), _even(len(knots)), knots), count)
     width = max(1, int(share * count))
     padded = np.concatenate([np.repeat(fine[:1], width, 0), fine, np.repeat(fine[-1:], width, 0)])
     kernel = np.hanning(2 * width + 1) + (width == 1)
     smooth = np.stack([np.convolve(column, kernel / kernel.sum(), "valid") for column in padded.T], axis=1)
     smooth[[0, -1]] = fine[[0, -1]]
     return np.asarray(smooth if share else fine)
-
-
-def _loop(t: Array, gap: float) -> Array:
-    angle = 2 * np.pi * np.clip(3 * t - 1, 0, 1)
-    return _columns(3 * t + np.sin(angle), 1 - np.cos(angle), gap * t)
 
 
 def _random(dim: int, bends: int, count: int, draw: np.random.Generator) -> Array:
@@ -196,34 +173,30 @@ def _random(dim: int, bends: int, count: int, draw: np.random.Generator) -> Arra
     return np.asarray(sum(waves) + 2 * t * draw.standard_normal(dim))
 
 
-def _rests(count: int) -> Array:
-    return np.interp(_even(count), [0, 0.2, 0.4, 0.6, 0.8, 1], [0, 0, 0.5, 0.5, 1, 1])
-
-
 def row(curve: Curve) -> dict[str, Any]:
     """What became of one curve."""
     shown, clean = curve
     began = time.perf_counter()
-    told: dict[str, Any] = {"curve": shown.name, "kind": kind_of(shown.name), "dim": shown.dim, "points": len(shown)}
+    about: dict[str, Any] = {"curve": shown.name, "kind": kind_of(shown.name), "dim": shown.dim, "points": len(shown)}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", FitWarning)  # the row tells it
             ds = TubeDS(shown.dim).fit(shown)
     except ValueError as error:
-        return told | {"follows": False, "seconds": time.perf_counter() - began, "note": f"{REFUSED}{error}"}
+        return about | {"follows": False, "seconds": time.perf_counter() - began, "note": f"{REFUSED}{error}"}
     seconds = time.perf_counter() - began
-    times = np.linspace(0, clean.duration, POINTS)
+    times = np.linspace(0, clean.duration, ROLLOUT_POINTS)
     with torch.no_grad():
         path = ds.rollout(shown.start, torch.from_numpy(times)).numpy()
-    missed = metrics.dtw(path, clean.at(times)) / POINTS / clean.size
+    missed = metrics.dtw(path, clean.at(times)) / ROLLOUT_POINTS / clean.size
     fit = ds.fit_report
     assert isinstance(fit, TubeReport)
     assert fit.fidelity is not None
-    return told | {
+    return about | {
         "n_layers": fit.n_layers,
         "miss": missed,
         "nearby": fit.fidelity.nearby,
-        "follows": missed <= FOLLOWS,
+        "follows": missed <= LARGEST_MISS,
         "seconds": seconds,
         "homotopy": fit.homotopy,
         "condition": fit.condition_path,
@@ -258,15 +231,9 @@ def main(
 ) -> None:
     """Fit TubeDS to curves that are hard to learn from."""
     rows = []
-    for curve in list(curves(seed))[:: 6 if quick else 1]:
-        if only not in curve.shown.name:
-            continue
+    for curve in [c for c in list(curves(seed))[:: 6 if quick else 1] if only in c.shown.name]:
         rows.append(row(curve))
-        print(
-            ", ".join(
-                f"{key} {value:.3g}" if isinstance(value, float) else f"{value}" for key, value in rows[-1].items()
-            )
-        )
+        print(", ".join(f"{key} {v:.3g}" if isinstance(v, float) else f"{v}" for key, v in rows[-1].items()))
     table = pd.DataFrame(rows)
     out.mkdir(parents=True, exist_ok=True)
     report.write(out / "rows.csv", table.to_csv(index=False))

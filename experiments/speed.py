@@ -23,22 +23,23 @@ import numpy as np
 import pandas as pd
 import torch
 import typer
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.markdown import Markdown
 from scipy.integrate import solve_ivp
+from scipy.optimize import minimize_scalar
 from torch import Tensor, nn
 
 from baselines import SDSEF
-from experiments import deployed, figures, goals, loops, report
-from experiments.goals import Goal
+from experiments import deployed, report
+from experiments.report import Goal, at_most
 from latentds import ChebyshevDS, TubeDS, datasets, kernels
+from latentds.arguments import Array
 from latentds.fitting.matching import match
 from latentds.kernels.compiling import OPTIONS
 from latentds.kernels.dispatch import BLOCK, reference
 from latentds.kernels.lanes import WIDTH, exp, load, store
-
-Array = NDArray[np.float64]
+from latentds.translations import WIDTH_BOUND
 
 N_LAYERS = 150
 SHOWN = datasets.unstable_spiral(7)
@@ -71,6 +72,79 @@ def operations(dim: int) -> int:
     return dim + dim + 1 + dim
 
 
+# --- the calls as one writes them first, in loops of torch ------------------------------------------------------------
+
+Layers = list[tuple[Tensor, Tensor, Tensor]]
+"""(c, v, ρ) of each."""
+
+
+def layers_of(ds: ChebyshevDS) -> Layers:
+    psi = ds.diffeomorphism
+    return list(zip(*(part.detach() for part in (psi.centers, psi.directions, psi.widths)), strict=True))
+
+
+def forward_loop(layers: Layers, x: Tensor) -> Tensor:
+    for c, v, rho in layers:
+        x = x + torch.exp(-(rho**2) * ((x - c) ** 2).sum(-1, keepdim=True)) * v
+    return x
+
+
+def inverse_loop(layers: Layers, y: Tensor) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+    """x, and the gradient of each layer's weight with its direction, last layer first."""
+    steps = []
+    for c, v, rho in reversed(layers):
+        w = y - c
+        a, b, r = v @ v, (w * v).sum(-1, keepdim=True), (w * w).sum(-1, keepdim=True)
+        low, high, s = torch.zeros_like(b), torch.ones_like(b), torch.exp(-(rho**2) * r)
+        for _ in range(60):
+            k = torch.exp(-(rho**2) * (a * s * s - 2 * b * s + r))
+            gap = s - k
+            low, high = torch.where(gap < 0, s, low), torch.where(gap > 0, s, high)
+            new = s - gap / (1 - 2 * rho**2 * (b - a * s) * k)
+            new = torch.where((new < low) | (new > high), (low + high) / 2, new)
+            moved, s = (new - s).abs().max(), new
+            if moved < 1e-15:
+                break
+        y = y - s * v
+        steps.append((-2 * rho**2 * s * (y - c), v))
+    return y, steps
+
+
+def velocity_loop(layers: Layers, y: Tensor, latent_velocity: Callable[[Tensor], Tensor]) -> Tensor:
+    x, steps = inverse_loop(layers, y)
+    moved = latent_velocity(x)
+    for gradient, v in reversed(steps):
+        moved = moved + (gradient * moved).sum(-1, keepdim=True) * v
+    return moved
+
+
+def runge_kutta(field: Callable[[Tensor], Tensor], y: Tensor, times: Tensor) -> Tensor:
+    path = [y]
+    for h in times.diff():
+        k1 = field(y)
+        k2 = field(y + h / 2 * k1)
+        k3 = field(y + h / 2 * k2)
+        k4 = field(y + h * k3)
+        y = y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        path.append(y)
+    return torch.stack(path, dim=-2)
+
+
+def match_loop(x: Array, y: Array, n_layers: int, beta: float, mu: float) -> float:
+    """Greedy matching, one bounded scalar minimisation a layer; the mean squared error that it reaches."""
+    for _ in range(n_layers):
+        error = y - x
+        worst = int((error**2).sum(1).argmax())
+        v, squared = beta * error[worst], ((x - x[worst]) ** 2).sum(1)
+
+        def loss(rho: float, v: Array = v, squared: Array = squared, error: Array = error) -> float:
+            return float(((error - np.exp(-(rho**2) * squared)[:, None] * v) ** 2).sum())
+
+        rho = minimize_scalar(loss, bounds=(0, mu * WIDTH_BOUND / np.linalg.norm(v)), method="bounded").x
+        x = x + np.exp(-(rho**2) * squared)[:, None] * v
+    return float(((x - y) ** 2).mean())
+
+
 # --- timing -----------------------------------------------------------------------------------------------------------
 
 
@@ -95,15 +169,10 @@ def take_turns(rivals: Mapping[str, Callable[[], Any]], rounds: int, share: floa
 def race(what: str, least: float, slow: Callable[[], Any], fast: Callable[[], Any], rounds: int) -> Goal:
     """That ``fast`` is ``least`` times faster than ``slow``."""
     times = take_turns({"slow": slow, "fast": fast}, rounds)
-    return goals.ratio(what, least, times["slow"], times["fast"])
+    return report.ratio(what, least, times["slow"], times["fast"])
 
 
 # --- studies ----------------------------------------------------------------------------------------------------------
-
-
-def few(rounds: int) -> int:
-    """Of what takes long."""
-    return max(3, rounds // 4)
 
 
 def latent_points(ds: ChebyshevDS, count: int, seed: int = 0) -> Tensor:
@@ -114,16 +183,10 @@ def latent_points(ds: ChebyshevDS, count: int, seed: int = 0) -> Tensor:
 
 
 def against_floor(ds: ChebyshevDS, rounds: int) -> list[Goal]:
-    layers, x = loops.layers_of(ds), latent_points(ds, 100_000)
-    decode, buffer, repeats = partial(ds.decode, x), np.full(BLOCK, 0.5), 20_000
-    times = take_turns(
-        {
-            "decode": decode,
-            "exponentials": partial(exponentials, buffer, repeats),
-            "products": partial(products, buffer, repeats),
-        },
-        rounds,
-    )
+    layers, x = layers_of(ds), latent_points(ds, 100_000)
+    buffer, repeats = np.full(BLOCK, 0.5), 20_000
+    floors = {"exponentials": partial(exponentials, buffer, repeats), "products": partial(products, buffer, repeats)}
+    times = take_turns({"decode": partial(ds.decode, x), **floors}, rounds)
     each_exp = times["exponentials"] / repeats / BLOCK
     each_product = times["products"] / repeats / 12 / WIDTH
     floor = (each_exp + operations(3) * each_product) * N_LAYERS * len(x)
@@ -131,33 +194,30 @@ def against_floor(ds: ChebyshevDS, rounds: int) -> list[Goal]:
         f"floor {np.median(floor) / N_LAYERS / len(x) * 1e9:.2f} ns a layer and point: exponential "
         f"{np.median(each_exp) * 1e9:.2f} ns, {operations(3)} operations of {np.median(each_product) * 1e9:.3f} ns"
     )
-    return [
-        goals.median("decode 10⁵ points", "times the floor", 2.5, times["decode"] / floor, at_most=True, note=note),
-        race(
-            "decode 10⁵ points, torch loop", 35, partial(loops.forward, layers, x), partial(ds.decode, x), few(rounds)
-        ),
-    ]
+    above = report.median("decode 10⁵ points", "times the floor", 2.5, times["decode"] / floor, at_most=True, note=note)
+    loop = partial(forward_loop, layers, x)
+    return [above, race("decode 10⁵ points, torch loop", 35, loop, partial(ds.decode, x), max(3, rounds // 4))]
 
 
 def against_loop(ds: ChebyshevDS, rounds: int) -> list[Goal]:
-    layers, many = loops.layers_of(ds), ds.decode(latent_points(ds, 1000))
+    layers, many = layers_of(ds), ds.decode(latent_points(ds, 1000))
 
     def latent_velocity(x: Tensor) -> Tensor:
         return ds.dynamics(x, x, ds.frame())
 
-    found = []
+    single, goals = SHOWN.positions[400], []
     for label, points, least in (
         ("velocity of 1000 points", many, 80),
-        ("velocity of one point, ds(y)", SHOWN.positions[400], 100),
+        ("velocity of one point, ds(y)", single, 100),
     ):
-        fast, slow = partial(ds, points), partial(loops.velocity, layers, points, latent_velocity)
+        fast, slow = partial(ds, points), partial(velocity_loop, layers, points, latent_velocity)
         torch.testing.assert_close(fast(), slow(), rtol=1e-8, atol=1e-8)
-        found.append(race(f"{label}, torch loop", least, slow, fast, rounds))
-    return found
+        goals.append(race(f"{label}, torch loop", least, slow, fast, rounds))
+    return goals
 
 
 def control_loop(calls: int) -> list[Goal]:
-    found = []
+    goals = []
     for n_layers, most in ((150, 60), (750, 120)):
         controller = ChebyshevDS(3, n_layers=n_layers).fit(SHOWN).controller()
         points, out = SHOWN.positions.numpy(), np.empty(3)
@@ -170,36 +230,36 @@ def control_loop(calls: int) -> list[Goal]:
                 seconds[i] = clock() - began
         micro = wall * 1e6
         label = f"controller(y), M = {n_layers}"
-        found.append(goals.median(f"{label}, median", "µs", most, micro, at_most=True))
+        goals.append(report.median(f"{label}, median", "µs", most, micro, at_most=True))
         late = float(np.quantile(micro, 0.99))
         note = f"worst of {calls}: {micro.max():.0f} µs; of CPU time {np.quantile(busy, 0.99) * 1e6:.0f} µs"
-        slow = goals.at_most(f"{label}, 99th percentile", pd.Series([late]), 1000)
-        found.append(slow._replace(unit="µs", note=note))
-    return found
+        goals.append(at_most(f"{label}, 99th percentile", late, 1000, unit="µs", note=note))
+    return goals
 
 
 def rollouts(ds: ChebyshevDS, rounds: int) -> list[Goal]:
     generator = torch.Generator().manual_seed(0)
     starts = SHOWN.start + 0.1 * torch.randn(16, 3, generator=generator, dtype=torch.float64)
     times = torch.linspace(0, SHOWN.duration, 1000, dtype=torch.float64)
-    fast, slow = partial(ds.rollout, starts, times), partial(loops.runge_kutta, ds, starts, times)
-    clock = take_turns({"fast": fast, "rk4": slow}, few(rounds))
+    fast, slow = partial(ds.rollout, starts, times), partial(runge_kutta, ds, starts, times)
+    clock = take_turns({"fast": fast, "rk4": slow}, max(3, rounds // 4))
     controller = ds.controller()
-    found = fast()
+
+    def field(_: float, y: Array) -> Array:
+        return controller(y)
+
+    closed_form = fast()
     began, worst = time.thread_time(), 0.0
-    for start, path in zip(starts.numpy(), found.numpy(), strict=True):
-        exact = solve_ivp(
-            lambda _, y: controller(y), (0, SHOWN.duration), start, "RK45", times.numpy(), rtol=1e-9, atol=1e-12
-        )
+    for start, path in zip(starts.numpy(), closed_form.numpy(), strict=True):
+        exact = solve_ivp(field, (0, SHOWN.duration), start, "RK45", times.numpy(), rtol=1e-9, atol=1e-12)
         worst = max(worst, float(np.abs(exact.y.T - path).max()))
     seconds = np.array([time.thread_time() - began])
-    coarse = float((slow() - found).abs().max())
+    coarse = float((slow() - closed_form).abs().max())
+    note = f"RK4 of 1000 steps: {coarse:.1e}"
     return [
-        goals.ratio("rollout 16 x 1000, RK4 on ds(y)", 60, clock["rk4"], clock["fast"]),
-        goals.ratio("rollout 16 x 1000, dopri5 on controller(y)", 60, seconds, clock["fast"]),
-        goals.at_most("rollout, distance from dopri5 (rtol 1e-9)", pd.Series([worst]), 1e-6)._replace(
-            unit="units", note=f"RK4 of 1000 steps: {coarse:.1e}"
-        ),
+        report.ratio("rollout 16 x 1000, RK4 on ds(y)", 60, clock["rk4"], clock["fast"]),
+        report.ratio("rollout 16 x 1000, dopri5 on controller(y)", 60, seconds, clock["fast"]),
+        at_most("rollout, distance from dopri5 (rtol 1e-9)", worst, 1e-6, unit="units", note=note),
     ]
 
 
@@ -219,28 +279,26 @@ def gradients(rounds: int) -> list[Goal]:
         with reference():
             return gradient(loss)
 
-    found = []
+    goals = []
     for name, loss in losses.items():
         fast, slow = partial(gradient, loss), partial(by_torch, loss)
         apart = float((fast() - slow()).norm() / slow().norm())
-        goal = race(f"gradient of the {name}, M = 300, N = 1000, torch path", 10, slow, fast, few(rounds))
-        found += [goal, goals.at_most("... relative difference", pd.Series([apart]), 1e-10)]
-    return found
+        goal = race(f"gradient of the {name}, M = 300, N = 1000, torch path", 10, slow, fast, max(3, rounds // 4))
+        goals += [goal, at_most("... relative difference", apart, 1e-10)]
+    return goals
 
 
 def fits(rounds: int) -> list[Goal]:
     x, y = ChebyshevDS.latent_line(SHOWN), SHOWN.positions.numpy()
-    fast, slow = partial(match, x, y, 300, 0.5, 0.9), partial(loops.match, x, y, 300, 0.5, 0.9)
+    fast, slow = partial(match, x, y, 300, 0.5, 0.9), partial(match_loop, x, y, 300, 0.5, 0.9)
     psi = ChebyshevDS(3, n_layers=300).diffeomorphism
     psi.assign(*(torch.from_numpy(part) for part in fast()))
     error = float((psi(torch.from_numpy(x)) - SHOWN.positions).square().mean())
     theirs = slow()
     note = f"MSE {error:.3g} against {theirs:.3g}"
     return [
-        race("fit, M = 300, N = 1000, bounded scalar search", 30, slow, fast, few(rounds)),
-        goals.at_most("fit, MSE over that of the bounded search", pd.Series([error / theirs]), 1)._replace(
-            unit="ratio", note=note
-        ),
+        race("fit, M = 300, N = 1000, bounded scalar search", 30, slow, fast, max(3, rounds // 4)),
+        at_most("fit, MSE over that of the bounded search", error / theirs, 1, unit="ratio", note=note),
     ]
 
 
@@ -282,25 +340,27 @@ def sdsef_step(rounds: int) -> list[Goal]:
 
 
 def growth(quick: bool) -> pd.DataFrame:
-    """Seconds of each call as N or M grows, and the exponent of the last decade or so."""
+    """Seconds of each call as N or M grows."""
     rows = []
+
+    def measure(grows: str, size: int, calls: Mapping[str, Callable[[], Any]], rounds: int) -> None:
+        for call, seconds in take_turns(calls, rounds).items():
+            rows.append((grows, call, size, float(np.median(seconds))))
+
     ds = ChebyshevDS(3, n_layers=N_LAYERS).fit(SHOWN)
-    for count in (1, 10, 100, 1000, 10_000, 100_000) if quick else (1, 10, 100, 1000, 10_000, 100_000, 1_000_000):
+    for count in (10**power for power in range(6 if quick else 7)):
         x = latent_points(ds, count)
         y = ds.decode(x)
         calls = {"decode": partial(ds.decode, x), "encode": partial(ds.encode, y), "velocity": partial(ds, y)}
-        for call, values in take_turns(calls, 5).items():
-            rows.append(("N", call, count, float(np.median(values))))
+        measure("N", count, calls, 5)
     for n_layers in (25, 50, 100, 200, 400, 800):
         ds = ChebyshevDS(3, n_layers=n_layers).fit(SHOWN)
         y = ds.decode(latent_points(ds, 10_000))
-        for call, values in take_turns({"velocity": partial(ds, y), "fit": partial(ds.fit, SHOWN)}, 3).items():
-            rows.append(("M", call, n_layers, float(np.median(values))))
+        measure("M", n_layers, {"velocity": partial(ds, y), "fit": partial(ds.fit, SHOWN)}, 3)
     for count in (125, 250, 500, 1000, 2000, 4000, 8000):
         shown = datasets.unstable_spiral(7, count)
-        fit = partial(match, ChebyshevDS.latent_line(shown), shown.positions.numpy(), N_LAYERS, 0.5, 0.9)
-        values = take_turns({"match": fit}, 5)["match"]
-        rows.append(("N", "match", count, float(np.median(values))))
+        line, positions = ChebyshevDS.latent_line(shown), shown.positions.numpy()
+        measure("N", count, {"match": partial(match, line, positions, N_LAYERS, 0.5, 0.9)}, 5)
     return pd.DataFrame(rows, columns=["grows", "call", "size", "seconds"])
 
 
@@ -315,6 +375,19 @@ def exponents(curves: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["grows", "call", "from", "to", "exponent"])
 
 
+def draw_growth(curves: pd.DataFrame) -> Figure:
+    """Seconds of each call over points N and layers M, on log scales; columns grows, call, size and seconds."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    for axis, (grows, label) in zip(figure.subplots(1, 2), (("N", "points N"), ("M", "layers M")), strict=True):
+        for call, curve in curves[curves["grows"] == grows].groupby("call"):
+            axis.loglog(curve["size"], curve["seconds"], "o-", label=call, markersize=3)
+        axis.set(xlabel=label, ylabel="seconds")
+        axis.xaxis.set_minor_formatter("")
+        axis.grid(alpha=0.3)
+        axis.legend(frameon=False)
+    return figure
+
+
 def main(
     quick: Annotated[bool, typer.Option(help="Fewer rounds, no million points, one export: some two minutes.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for tables, curves and the picture.")] = Path("results/speed"),
@@ -325,7 +398,7 @@ def main(
     console, rounds = Console(), 9 if quick else 41
     kernels.warmup([3])
     ds = ChebyshevDS(3, n_layers=N_LAYERS).fit(SHOWN)
-    found = [
+    goals = [
         *against_floor(ds, rounds),
         *against_loop(ds, rounds),
         *control_loop(2000 if quick else 20_000),
@@ -336,22 +409,16 @@ def main(
         *deployed.measure(quick),
     ]
     curves = growth(quick)
-    summary = "\n\n".join(
-        [
-            f"Load average while it ran: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; 1 core is used.",
-            goals.table(found),
-            report.table(
-                ("grows", "call", "from", "to", "exponent of the time"),
-                [(*map(str, row[:-1]), f"{row[-1]:.2f}") for row in exponents(curves).itertuples(index=False)],
-            ),
-        ]
-    )
+    load = f"Load average while it ran: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; 1 core is used."
+    powers = [(*map(str, row[:-1]), f"{row[-1]:.2f}") for row in exponents(curves).itertuples(index=False)]
+    growth_table = report.table(("grows", "call", "from", "to", "exponent of the time"), powers)
+    summary = "\n\n".join([load, report.goal_table(goals), growth_table])
     out.mkdir(parents=True, exist_ok=True)
-    report.write(out / "goals.csv", pd.DataFrame(found).to_csv(index=False))
+    report.write(out / "goals.csv", pd.DataFrame(goals).to_csv(index=False))
     report.write(out / "growth.csv", curves.to_csv(index=False))
     report.write(out / "summary.md", summary + "\n")
     report.write(out / "environment.json", report.environment())
-    figures.growth(curves).savefig(out / "growth.png", dpi=150)
+    draw_growth(curves).savefig(out / "growth.png", dpi=150)
     console.print(Markdown(summary))
     console.print(f"{out}: summary.md, goals.csv, growth.csv, growth.png, environment.json")
 

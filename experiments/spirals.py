@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import joblib
 import numpy as np
@@ -22,9 +23,8 @@ import typer
 from rich.console import Console
 from rich.markdown import Markdown
 
-from experiments import report, scores
-from experiments.methods import RIVALS, methods
-from experiments.motions import spirals
+from experiments import report
+from experiments.compared import RIVALS, methods, spirals
 from experiments.published import TABLE_ONE
 from latentds import Demonstration, plotting
 from latentds import report as page
@@ -120,13 +120,19 @@ NOTES = f"""Raw sums of Euclidean distances over 500 points; lower is better, **
 exact DTW by more than 5 %. p: {RIVALS[0]} against {RIVALS[1]} on the shared starts, paired t-test and Welch's."""
 
 
+def _fits(rows: pd.DataFrame, name: str, labels: Sequence[str]) -> dict[str, pd.DataFrame]:
+    """{method: its rows on the spiral of that name}."""
+    of = rows[rows["demonstration"] == name]
+    return {label: of[of["method"] == label] for label in labels}
+
+
 def _scores(rows: pd.DataFrame, score: str, names: list[str], labels: list[str]) -> str:
     tested = rows["start"].nunique() > 1
     lines = []
     for name in names:
+        fits = _fits(rows, name, labels)
         # A deterministic method scores the same with every seed: seeds must not count as more starts.
-        of = {label: rows[(rows["demonstration"] == name) & (rows["method"] == label)] for label in labels}
-        starts = {label: scored.groupby("start")[score].mean() for label, scored in of.items()}
+        starts = {label: fit.groupby("start")[score].mean() for label, fit in fits.items()}
         means = {label: values.mean(skipna=False) for label, values in starts.items()}
         best = min((mean for mean in means.values() if np.isfinite(mean)), default=np.nan)
         line = [name]
@@ -136,7 +142,7 @@ def _scores(rows: pd.DataFrame, score: str, names: list[str], labels: list[str])
                 continue
             text = f"{means[label]:.2f}" + (f" ± {values.std():.2f}" if tested else "")
             text = f"**{text}**" if means[label] == best else text
-            exact, fast = of[label]["dtw"].mean(), of[label]["dtw_fast"].mean()
+            exact, fast = fits[label]["dtw"].mean(), fits[label]["dtw_fast"].mean()
             line.append(text + (" †" if abs(fast - exact) > 0.05 * exact else ""))
         lines.append(line + ([_p_values(*(starts[rival] for rival in RIVALS))] if tested else []))
     return report.table(["spiral", *labels, *(["p paired / Welch"] if tested else [])], lines)
@@ -147,34 +153,31 @@ def _by_seed(rows: pd.DataFrame, names: list[str]) -> str:
     rows = rows[rows["demonstration"].isin(names)]
     means = rows.pivot_table(index=["demonstration", "method"], columns="seed", values="dtw", sort=False)
     means = means[means.max(axis=1) > means.min(axis=1) * (1 + 1e-9)]
-    lines = [[*key, *("—" if np.isnan(one) else f"{one:.2f}" for one in scores)] for key, *scores in means.itertuples()]
+    lines = [
+        [*key, *("—" if np.isnan(mean) else f"{mean:.2f}" for mean in seeds)] for key, *seeds in means.itertuples()
+    ]
     return report.table(["spiral", "method", *(f"seed {seed}" for seed in means.columns)], lines)
 
 
 def _p_values(first: pd.Series, second: pd.Series) -> str:
     if len(first) < 2 or len(first) != len(second) or not np.isfinite([*first, *second]).all():
         return "—"
-    return f"{scores.paired(first, second):.1e} / {scores.welch(first, second):.1e}"
+    return f"{report.paired(first, second):.1e} / {report.welch(first, second):.1e}"
 
 
 def _table_one(rows: pd.DataFrame, names: list[str]) -> str:
     lines = []
     for name in names:
-        line = [name]
-        for label in RIVALS:
-            reached = rows[(rows["demonstration"] == name) & (rows["method"] == label)]["mse"].mean()
-            paper = TABLE_ONE[label][name].mse
-            line += [f"{reached:.2e}", f"{paper:.2e}", f"{reached / paper:.2f}"]
-        lines.append(line)
+        errors = [(fit["mse"].mean(), TABLE_ONE[label][name].mse) for label, fit in _fits(rows, name, RIVALS).items()]
+        cells = [(f"{ours:.2e}", f"{paper:.2e}", f"{ours / paper:.2f}") for ours, paper in errors]
+        lines.append([name, *chain(*cells)])
     return report.table(["spiral", *(f"{r}{what}" for r in RIVALS for what in ("", ", paper", ", ratio"))], lines)
 
 
 def _follows(rows: pd.DataFrame, names: list[str], labels: list[str]) -> str:
-    lines = []
-    for name in names:
-        fits = [rows[(rows["demonstration"] == name) & (rows["method"] == label)] for label in labels]
-        lines.append([name, *(_how_many(fit.groupby("seed")["follows"].all().tolist()) for fit in fits)])
-    return report.table(["spiral", *labels], lines)
+    fits = {name: _fits(rows, name, labels).values() for name in names}
+    by_seed = {name: [fit.groupby("seed")["follows"].all().tolist() for fit in of] for name, of in fits.items()}
+    return report.table(["spiral", *labels], [[name, *map(_how_many, of)] for name, of in by_seed.items()])
 
 
 def _how_many(follows: list[bool]) -> str:
@@ -189,24 +192,23 @@ def _failures(rows: pd.DataFrame) -> str:
         return "None."
     bad = bad.assign(what=bad["status"].where(bad["status"] != "ok", "not converged"))
     groups = bad.groupby(["demonstration", "method", "what", "error"], sort=False).size()
-    return report.table(
-        ["spiral", "method", "what", "error", "rows"], [[*map(str, key), str(n)] for key, n in groups.items()]
-    )
+    lines = [[*map(str, key), str(count)] for key, count in groups.items()]
+    return report.table(["spiral", "method", "what", "error", "rows"], lines)
 
 
 def draw(rows: pd.DataFrame, moved: Paths, shown: list[Demonstration], out: Path) -> None:
-    order = list(methods(shown[0].name, False))
+    """A picture of every spiral's rollouts with its first seed, and of each family's scores."""
     for demonstration in shown:
-        first = {method: paths for (method, of, _), paths in reversed([*moved.items()]) if of == demonstration.name}
-        paths = {label: first[label] for label in order if label in first}
+        paths: dict[str, Any] = {}
+        for (method, of, _), path in moved.items():
+            if of == demonstration.name:
+                paths.setdefault(method, path)
         name = demonstration.name.replace(" ", "_").replace("=", "")
         plotting.replications(demonstration, paths).savefig(out / f"{name}.png")
-    ranked = rows.assign(rank=rows["method"].map(order.index)).sort_values(["demonstration", "rank"])
     for family in dict.fromkeys(d.name.split()[0] for d in shown):
-        names = [d.name for d in shown if d.name.startswith(family)]
-        chosen = pd.concat([ranked[ranked["demonstration"] == name] for name in names])
-        if not chosen.empty:
-            plotting.dtw_bars(chosen, f"{family} spirals").savefig(out / f"dtw_{family}.png")
+        scored = rows[rows["demonstration"].str.startswith(family)]
+        if not scored.empty:
+            plotting.dtw_bars(scored, f"{family} spirals").savefig(out / f"dtw_{family}.png")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
 """The paper, reproduced: its tables, figures and claims, set beside ours. See ``__main__`` for the command.
 
-``measurements`` computes (by ``tuning``, ``held_out``, ``latent_space`` and ``variants``), ``sections`` and ``figures``
-tell, ``verdicts`` judges.
+One file per section of the report: what it measures, writes and judges. ``study`` and ``tuning`` hold what they share,
+``document`` what they write into.
 """

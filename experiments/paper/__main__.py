@@ -9,7 +9,7 @@ tuning in optuna.sqlite, both in ``--out``: an interrupted run goes on where it 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -18,12 +18,33 @@ import typer
 from rich.console import Console
 
 from experiments import report
-from experiments.motions import recordings
+from experiments.compared import recordings
 from experiments.paper.document import Document
-from experiments.paper.plan import FULL, QUICK, Plan
-from experiments.paper.sections import STEPS
-from experiments.paper.study import Study
+from experiments.paper.framework import framework, left_out
+from experiments.paper.joints import joints
+from experiments.paper.latent_space import latent_space
+from experiments.paper.planes import orbits, planes
+from experiments.paper.sensitivity import sensitivity
+from experiments.paper.similarity import replications, similarity
+from experiments.paper.study import FULL, QUICK, Plan, Study
+from experiments.paper.table_one import table_one, tuned
+from experiments.paper.table_two import table_two
 from latentds import Demonstration
+
+SECTIONS: dict[str, Callable[[Study, Document], None]] = {
+    "The framework": framework,
+    "Table I: the paper's hyperparameters": table_one,
+    "Tuning by the paper's rule": tuned,
+    "Claims about the latent space": latent_space,
+    "Two dimensions: Archimedean spiral and drawn characters": planes,
+    "Joint space, Table III": joints,
+    "Sensitivity": sensitivity,
+    "Similarity scores and p-values": similarity,
+    "Table II: SDS-EF": table_two,
+    "Replications": replications,
+    "DMP's forward orbits": orbits,
+    "What is left out": left_out,
+}
 
 
 def main(
@@ -38,11 +59,8 @@ def main(
     """Reproduce the paper. An interrupted run goes on where it stopped."""
     out = out or Path("results/paper-quick" if quick else "results/paper")
     doc = doc or (out / "reproduction.md" if quick else Path("docs/reproduction.md"))
-    try:
-        recorded = recordings([data] if data else [])
-    except (ValueError, FileNotFoundError) as error:
-        raise typer.BadParameter(str(error)) from None
-    reproduce(QUICK if quick else FULL, out, doc, joblib.cpu_count() if jobs is None else jobs, recorded)
+    n_jobs = joblib.cpu_count() if jobs is None else jobs
+    reproduce(QUICK if quick else FULL, out, doc, n_jobs, recordings([data] if data else []))
 
 
 def reproduce(plan: Plan, out: Path, doc: Path, jobs: int, recorded: Sequence[Demonstration] = ()) -> None:
@@ -51,18 +69,15 @@ def reproduce(plan: Plan, out: Path, doc: Path, jobs: int, recorded: Sequence[De
     doc.parent.mkdir(parents=True, exist_ok=True)
     console, began = Console(), time.perf_counter()
     study = Study(plan, out, jobs, recorded)
-    found = Document(doc.parent / "images" / "reproduction")
-    try:
-        for title, step in STEPS.items():
+    document = Document(doc.parent / "images" / "reproduction")
+    with report.interruptible(console):
+        for title, section in SECTIONS.items():
             since = time.perf_counter()
-            found.add(f"## {title}")
-            step(study, found)
+            document.add(f"## {title}")
+            section(study, document)
             console.print(f"{title}: {time.perf_counter() - since:.0f} s")
-    except KeyboardInterrupt:
-        console.print("Interrupted; the same command goes on from here.")
-        raise typer.Exit(130) from None
     seconds = time.perf_counter() - began
-    report.write(doc, found.text(plan.quick, bool(recorded), seconds))
+    report.write(doc, document.text(plan.quick, bool(recorded), seconds))
     report.write(out / "environment.json", report.environment())
     console.print(f"{doc}: written after {seconds:.0f} s")
 

@@ -5,17 +5,53 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, NamedTuple
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from experiments import report
-from experiments.paper import figures
-from experiments.paper.verdicts import SIMILAR, Finding
+from latentds.plotting import SHOWN
+
+SIMILAR = 3.0
+"""Factor within which a measured figure counts as reproduced."""
+NO_NUMBERS = "not reproducible: no numbers to compare with"
+REPRODUCED, IN_PART, CONTRADICTED = "reproduced", "reproduced in part", "contradicted"
+DPI = 100
+GOAL: dict[str, Any] = {"marker": "*", "color": "#E69F00", "mec": SHOWN, "mew": 0.6, "ms": 12, "ls": ""}
+"""How the goal of a motion is drawn."""
+
+
+class Finding(NamedTuple):
+    """One line of the summary."""
+
+    what: str
+    paper: str
+    ours: str
+    verdict: str
+
+
+def similar(*ratios: float) -> str:
+    """The verdict on errors over the paper's: all within the factor, or on which side of it they are not."""
+    if max(ratios) > SIMILAR:
+        return "worse"
+    return REPRODUCED if min(ratios) >= 1 / SIMILAR else "better"
+
+
+def verdict(holds: Any) -> str:
+    """Of a claim that holds or does not."""
+    return REPRODUCED if holds else CONTRADICTED
+
+
+def span(values: Iterable[float]) -> str:
+    """The least and the largest, "2.5e-8 … 1.6e-5"."""
+    ends = sorted(values)
+    return " … ".join(np.format_float_scientific(end, 1, exp_digits=1) for end in (ends[0], ends[-1]))
 
 
 @dataclass
 class Document:
-    """What the run found so far; pictures go to the folder ``pictures``, two below the report's."""
+    """What the run has written so far; pictures go to the folder ``pictures``, two below the report's."""
 
     pictures: Path
     parts: list[str] = field(default_factory=list)
@@ -27,12 +63,12 @@ class Document:
     def table(self, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
         self.add(report.table(header, list(rows)))
 
-    def find(self, *findings: Finding) -> None:
-        self.findings += findings
+    def find(self, what: str, paper: str, ours: str, verdict: str) -> None:
+        self.findings.append(Finding(what, paper, ours, verdict))
 
     def show(self, name: str, figure: Figure, caption: str) -> None:
         self.pictures.mkdir(parents=True, exist_ok=True)
-        figure.savefig(self.pictures / f"{name}.png", dpi=figures.DPI)
+        figure.savefig(self.pictures / f"{name}.png", dpi=DPI)
         self.add(f"![{caption}]({self.pictures.parent.name}/{self.pictures.name}/{name}.png)\n\n*{caption}*")
 
     def text(self, quick: bool, recorded: bool, seconds: float) -> str:

@@ -1,32 +1,66 @@
-"""The plan's motions, their tuning and the main comparison, each computed once."""
+"""How much of the paper is reproduced, all of it or a quick part, and what several sections draw on."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from functools import cached_property, partial
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-from baselines import SDSEF
-from experiments.methods import RIVALS, greedy
-from experiments.motions import spiral
+from experiments.compared import spiral
 from experiments.paper import tuning
-from experiments.paper.held_out import held_out
-from experiments.paper.plan import Plan
-from experiments.published import TABLE_ONE, TABLE_TWO, Setting
-from latentds import Demonstration
-from latentds.benchmark import Cell, Outcome, RolloutProtocol, run
+from experiments.published import TABLE_ONE, Setting
+from latentds import Demonstration, datasets
+from latentds.benchmark import Cell, Paths, RolloutProtocol, run, table
 from latentds.fitting.tuning import Choice, Tried, choose
 
-SDS_EF = ("SDS-EF", "SDS-EF official")
-"""By our recipe, and by its authors'."""
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is done.
+
+    Attributes:
+        spirals, sensitive: names of spirals; the latter are varied.
+        grid: of the greedy methods.
+        official, tuned: SDS-EF's (L, n_f) where the paper prints none, by either recipe; ``printed`` whether its own
+            are used where it does.
+        official_epochs, tuned_epochs: most epochs of either recipe; None: the recipe's own.
+        layers, features, epochs: SDS-EF's grid, and the epochs of its trials.
+        strokes, lasa, arms: planar motions, shapes of handwriting and cases of the joint-space study.
+        n_starts, n_points: of the protocol.
+        quick: whether the report must say that it is not the whole.
+    """
+
+    spirals: tuple[str, ...] = tuple(d.name for d in datasets.spiral_suite(3))
+    sensitive: tuple[str, ...] = ("unstable c=3", "unstable c=7", "unstable c=10", "stable c=3")
+    grid: tuning.Grid = tuning.FULL
+    official: tuple[int, int] = (10, 200)
+    tuned: tuple[int, int] = (10, 200)
+    printed: bool = True
+    official_epochs: int = 5000
+    tuned_epochs: int | None = None
+    layers: tuple[int, ...] = (10, 20)
+    features: tuple[int, ...] = (150, 300)
+    epochs: int = 1000
+    strokes: tuple[str, ...] = tuple(datasets.STROKES)
+    lasa: tuple[str, ...] = ("GShape", "JShape", "Khamesh", "Sshape")
+    arms: int = 6
+    n_starts: int = 20
+    n_points: int = 500
+    quick: bool = False
+
+
+FULL = Plan()
+QUICK = Plan(
+    spirals=("unstable c=1", "unstable c=7", "stable c=3"), sensitive=("unstable c=7",), grid=tuning.QUICK,
+    official=(4, 40), tuned=(4, 60), printed=False, official_epochs=300, layers=(2, 4), features=(40,), epochs=100,
+    strokes=("hook", "curl"), lasa=(), arms=2, quick=True,
+)  # fmt: skip
 
 
 class Study:
-    """What several sections draw on.
+    """The plan's motions, their tuning, each computed once, and cells that are kept.
 
     Args:
         plan: how much is done.
@@ -36,74 +70,44 @@ class Study:
     """
 
     def __init__(self, plan: Plan, out: Path, jobs: int, recorded: Sequence[Demonstration] = ()) -> None:
-        self.plan, self.jobs, self.recorded = plan, jobs, recorded
-        self.store = out / "cells.sqlite"
-        self.tuner = tuning.Tuner(out / "optuna.sqlite", jobs)
+        self.plan, self.out, self.jobs, self.recorded = plan, out, jobs, recorded
         self.spirals = [spiral(name) for name in plan.spirals]
-        self._tuned: dict[tuple[str, str], tuple[list[Tried], list[Tried]]] = {}
+        self._tried: dict[tuple[str, str], tuple[list[Tried], list[Tried]]] = {}
 
     def tried(self, method: str, shown: Demonstration) -> tuple[list[Tried], list[Tried]]:
-        """Of the grid, and of TPE."""
+        """On the grid, and by TPE."""
         key = method, shown.name
-        if key not in self._tuned:
-            self._tuned[key] = self.tuner.greedy(method, shown, self.plan.grid)
-        return self._tuned[key]
+        if key not in self._tried:
+            self._tried[key] = tuning.tune(method, shown, self.plan.grid, self.out / "optuna.sqlite", self.jobs)
+        return self._tried[key]
 
     def choice(self, method: str, shown: Demonstration) -> Choice:
+        """By the paper's rule."""
         return choose(self.tried(method, shown)[0])
+
+    def least_beta(self, method: str, shown: Demonstration) -> Setting:
+        """The rule's with the least β."""
+        return setting(self.choice(method, shown).least_beta)
 
     def setting(self, method: str, shown: Demonstration) -> Setting:
         """The paper's where it prints one, else its rule's with the least β."""
-        return TABLE_ONE[method].get(shown.name) or tuning.setting(self.choice(method, shown).least_beta)
+        return TABLE_ONE[method].get(shown.name) or self.least_beta(method, shown)
 
     def protocol(self, *, n_starts: int | None = None, radius: float = 0.1) -> RolloutProtocol:
         """The plan's; ``n_starts`` of its own if given."""
         return RolloutProtocol(self.plan.n_starts if n_starts is None else n_starts, radius, self.plan.n_points)
 
-    def run(self, cells: Iterable[Cell], protocol: RolloutProtocol) -> list[Outcome]:
-        return list(run(cells, protocol, n_jobs=self.jobs, progress=True, store=self.store))
-
-    @cached_property
-    def outcomes(self) -> list[Outcome]:
-        """Of every method on every spiral, from the demonstrated start and those around it."""
-        cells = [make(shown) for make in (self._official, self._tuned_recipe) for shown in self.spirals]
-        for shown in self.spirals:
-            for method in RIVALS:
-                chosen = self.choice(method, shown)
-                for label, setting in {
-                    method: self.setting(method, shown),
-                    f"{method}, least β": tuning.setting(chosen.least_beta),
-                    f"{method}, least MSE": tuning.setting(chosen.least_mse),
-                }.items():
-                    cells.append(Cell(label, greedy(method, setting), shown))
-        return self.run(cells, self.protocol())
-
-    def _official(self, shown: Demonstration) -> Cell:
-        """SDS-EF by its authors' recipe and the paper's split, with the paper's size where it prints one."""
-        size = TABLE_TWO.get(shown.name, ())[:2] if self.plan.printed else ()
-        n_layers, n_features = size or self.plan.official
-        return held_out(shown, n_layers, n_features, self.plan.official_epochs, SDS_EF[1])
-
-    def _tuned_recipe(self, shown: Demonstration) -> Cell:
-        n_layers, n_features = self.plan.tuned
-        factory = partial(SDSEF, n_layers=n_layers, n_features=n_features, epochs=self.plan.tuned_epochs)
-        return Cell(SDS_EF[0], factory, shown)
-
-    @cached_property
-    def rows(self) -> pd.DataFrame:
-        return rows(self.outcomes)
-
-    def scores(self, score: str) -> dict[str, dict[str, NDArray[np.float64]]]:
-        """{spiral: {method: its scores from the perturbed starts}}, the four methods of the figure."""
-        near = self.rows[self.rows["start"] > 0].groupby(["demonstration", "method"])[score]
-        return {d.name: {m: near.get_group((d.name, m)).to_numpy() for m in (*RIVALS, *SDS_EF)} for d in self.spirals}
+    def run(self, cells: Sequence[Cell], protocol: RolloutProtocol) -> tuple[pd.DataFrame, Paths]:
+        """Their rows and rollouts; finished cells come from the store."""
+        paths: Paths = {}
+        outcomes = run(cells, protocol, n_jobs=self.jobs, progress=True, store=self.out / "cells.sqlite")
+        return table(cells, outcomes, paths), paths
 
 
-def rows(outcomes: Iterable[Outcome]) -> pd.DataFrame:
-    return pd.DataFrame([row for outcome in outcomes for row in outcome.rows])
+def setting(tried: Tried) -> Setting:
+    return Setting(*tried[:4])
 
 
-def paths(outcomes: Iterable[Outcome], name: str, methods: Iterable[str]) -> dict[str, NDArray[np.float64]]:
-    """{method: its rollouts} on the motion of that name."""
-    moved = {o.method: o.paths for o in outcomes if o.demonstration == name}
-    return {method: moved[method] for method in methods}
+def brief(chosen: Setting) -> str:
+    """A cell of the tables, "β / μ / M: MSE"."""
+    return f"{chosen.beta:g} / {chosen.mu:g} / {chosen.n_layers}: {chosen.mse:.1e}"

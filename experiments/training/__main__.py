@@ -26,12 +26,9 @@ class Script(str, Enum):
     DENSITY = "density"
     CONTEXT = "context"
 
-
-LEARN: dict[Script, Callable[[bool, int, Path], Learned]] = {
-    Script.VIA_POINT: via_point.learn,
-    Script.DENSITY: density.learn,
-    Script.CONTEXT: context.learn,
-}
+    @property
+    def learn(self) -> Callable[[bool, int, Path], Learned]:
+        return {"via-point": via_point.learn, "density": density.learn, "context": context.learn}[self.value]
 
 
 def main(
@@ -43,18 +40,15 @@ def main(
     """Train. An interrupted run goes on where it stopped."""
     out, console = out or Path("results/training-quick" if quick else "results/training"), Console()
     for script in scripts or Script:
-        try:
+        with report.interruptible(console):
             learned = run(script, quick, seed, out)
-        except KeyboardInterrupt:
-            console.print("Interrupted; the same command goes on from here.")
-            raise typer.Exit(130) from None
         console.print(summary(learned), markup=False, highlight=False, soft_wrap=True)
 
 
 def run(script: Script, quick: bool, seed: int, out: Path) -> Learned:
     folder = out / script.value
     folder.mkdir(parents=True, exist_ok=True)
-    learned = LEARN[script](quick, seed, folder)
+    learned = script.learn(quick, seed, folder)
     report.write(folder / "summary.md", f"# {script.value}\n\n{summary(learned)}")
     report.write(folder / "environment.json", report.environment() | {"quick": quick, "seed": seed})
     learned.figure.savefig(folder / "picture.png")
@@ -63,7 +57,8 @@ def run(script: Script, quick: bool, seed: int, out: Path) -> Learned:
 
 def summary(learned: Learned) -> str:
     steps = [f"{len(learned.history)} steps", ""]
-    rows = [[what, f"{value:.3g}"] for what, value in learned.numbers.items()]
+    numbers = {"first loss": learned.history[0], "last loss": learned.history[-1], **learned.numbers}
+    rows = [[what, f"{value:.3g}"] for what, value in numbers.items()]
     return f"{report.table(steps, rows)}\n\n{learned.notes}\n"
 
 

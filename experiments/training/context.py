@@ -8,7 +8,8 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 
-from experiments.training.loop import Learned, Loop, plain, solid
+from experiments.report import plain
+from experiments.training.loop import Learned, Loop, solid
 from latentds import TubeDS, datasets, plotting
 
 CAMERAS = ((1.0, 0.0, 0.3), (0.0, 1.0, 0.0))
@@ -44,18 +45,16 @@ def learn(quick: bool, seed: int, folder: Path) -> Learned:
     draw = torch.Generator().manual_seed(seed + 1)
     cups = places(200, draw)
     with torch.no_grad():
-        found = paths(pictures(cups, draw), torch.linspace(0, shown.duration, 101))
-        passed = found[:, round(WHEN * (found.shape[1] - 1))] - middle
+        moved = paths(pictures(cups, draw), torch.linspace(0, shown.duration, 101))
+        passed = moved[:, round(WHEN * (moved.shape[1] - 1))] - middle
         ignored = ds.rollout(shown.start, met)[-1] - middle
     numbers = {
-        "first loss": history[0],
-        "last loss": history[-1],
         "held-out distance from the cup, goal as demonstrated": rms(ignored - cups),
         "held-out distance from the cup, goal by the network": rms(passed - cups),
         "distance that the noise alone costs": rms_by_noise(cups),
     }
     notes = f"Root mean squares over {len(cups)} cups, each seen once. The motion itself was not trained."
-    return Learned(history, numbers, notes, draw_cups(found, passed, cups, middle))
+    return Learned(history, numbers, notes, draw_cups(moved, passed, cups, middle))
 
 
 def small_network(inputs: int, outputs: int, seed: int) -> nn.Module:

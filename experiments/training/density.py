@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from torch.distributions import Distribution, MultivariateNormal, Normal, TransformedDistribution
 
-from experiments.training.loop import Learned, Loop, plain
+from experiments.report import plain
+from experiments.training.loop import Learned, Loop
 from latentds import LocallyWeightedTranslations, as_transform, plotting
 
 REACH, SPREAD, SPAN = 0.6, 0.05, math.radians(240)
@@ -30,8 +31,6 @@ def learn(quick: bool, seed: int, folder: Path) -> Learned:
     history = Loop("density", 100 if quick else 800, 2e-2, seed, folder / "checkpoint.pt").run(psi, loss)
     with torch.no_grad():
         numbers = {
-            "first loss": history[0],
-            "last loss": history[-1],
             "held-out log-likelihood, fitted Gaussian": float(gaussian.log_prob(held_out).mean()),
             "held-out log-likelihood, learned density": float(density.log_prob(held_out).mean()),
             "held-out log-likelihood, the true density": float(true_log_prob(held_out).mean()),
@@ -82,7 +81,7 @@ def draw_densities(gaussian: Distribution, density: Distribution, points: Tensor
     figure = Figure(figsize=(8.6, 4.4), dpi=plotting.DPI, layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     with torch.no_grad():
-        shades = [one.log_prob(where).exp() for one in (gaussian, density)]
+        shades = [p.log_prob(where).exp() for p in (gaussian, density)]
     for axes, shade, title in zip(panels, shades, ("fitted Gaussian", "learned density"), strict=True):
         image = axes.pcolormesh(
             *where.numpy().transpose(2, 0, 1), shade.numpy(), cmap="cividis", vmin=0, vmax=float(shades[1].max())

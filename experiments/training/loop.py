@@ -5,12 +5,10 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -18,8 +16,7 @@ from torch import Tensor, nn
 
 from latentds.files import atomic_write, read_file
 
-EVERY = 20
-"""Steps between checkpoints."""
+STEPS_PER_CHECKPOINT = 20
 
 
 class Learned(NamedTuple):
@@ -33,8 +30,7 @@ class Learned(NamedTuple):
     figure: Figure
 
 
-@dataclass(frozen=True)
-class Loop:
+class Loop(NamedTuple):
     """How long and how fast to descend.
 
     Attributes:
@@ -64,59 +60,47 @@ class Loop:
         adam = torch.optim.Adam(module.parameters(), self.rate)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(adam, self.steps)
         draw = torch.Generator().manual_seed(self.seed)
+        parts: dict[str, Any] = {"module": module, "adam": adam, "schedule": schedule}
         history: list[float] = []
         if self.checkpoint.exists():
-            kept = self._read()
-            for part, name in ((module, "module"), (adam, "adam"), (schedule, "schedule")):
-                part.load_state_dict(kept[name])
-            draw.set_state(kept["generator"])
-            history = kept["history"]
+            state = self._read()
+            for name, part in parts.items():
+                part.load_state_dict(state[name])
+            draw.set_state(state["generator"])
+            history = state["history"]
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         with Progress(*columns) as bar:
             task = bar.add_task(self.title, total=self.steps, completed=len(history))
             while len(history) < self.steps:
                 adam.zero_grad()
                 value = loss(draw)
-                told = value.item()
-                if not math.isfinite(told):
-                    raise FloatingPointError(f"loss: expected a finite number at step {len(history)}, got {told}")
+                number = value.item()
+                if not math.isfinite(number):
+                    raise FloatingPointError(f"loss: expected a finite number at step {len(history)}, got {number}")
                 value.backward()
                 adam.step()
                 schedule.step()
-                history.append(told)
-                bar.update(task, advance=1, description=f"{self.title}, loss {told:.3g}")
-                if len(history) % EVERY == 0 or len(history) == self.steps:
-                    parts = {
-                        "module": module.state_dict(),
-                        "adam": adam.state_dict(),
-                        "schedule": schedule.state_dict(),
-                    }
-                    rest = {"generator": draw.get_state(), "history": history, "about": self._about()}
+                history.append(number)
+                bar.update(task, advance=1, description=f"{self.title}, loss {number:.3g}")
+                if len(history) % STEPS_PER_CHECKPOINT == 0 or len(history) == self.steps:
+                    state = {name: part.state_dict() for name, part in parts.items()}
+                    state |= {"generator": draw.get_state(), "history": history, "about": self._about()}
                     with atomic_write(self.checkpoint) as file:
-                        torch.save(parts | rest, file)
+                        torch.save(state, file)
         return tuple(history)
 
     def _about(self) -> dict[str, object]:
-        return {"title": self.title, "steps": self.steps, "rate": self.rate, "seed": self.seed}
+        return {name: value for name, value in self._asdict().items() if name != "checkpoint"}
 
     def _read(self) -> dict:
         try:
-            kept: dict = torch.load(io.BytesIO(read_file(self.checkpoint)), weights_only=True)
-            theirs = kept["about"]
+            state: dict = torch.load(io.BytesIO(read_file(self.checkpoint)), weights_only=True)
+            about = state["about"]
         except Exception as error:  # whatever torch makes of a damaged file
             raise ValueError(f"checkpoint: {self.checkpoint} is none of this loop's ({error})") from None
-        if theirs != self._about():
-            raise ValueError(
-                f"checkpoint: expected {self._about()} in {self.checkpoint}, got {theirs}; take another --out"
-            )
-        return kept
-
-
-def plain(axes: Axes) -> None:
-    """Leave of the frame what carries numbers."""
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(color="#DDDDDD", lw=0.6)
-    axes.set_axisbelow(True)
+        if about != (mine := self._about()):
+            raise ValueError(f"checkpoint: expected {mine} in {self.checkpoint}, got {about}; take another --out")
+        return state
 
 
 def solid(axes: Any, azimuth: float) -> None:

@@ -10,7 +10,8 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from experiments.training.loop import Learned, Loop, plain, solid
+from experiments.report import plain
+from experiments.training.loop import Learned, Loop, solid
 from latentds import Demonstration, StableDS, TubeDS, certify, datasets, plotting
 
 BALL = 0.1
@@ -46,8 +47,6 @@ def learn(quick: bool, seed: int, folder: Path) -> Learned:
     before, after = (motions(system, held_out, shown) for system in (fitted, ds))
     certificate = certify(ds)
     numbers = {
-        "first loss": history[0],
-        "last loss": history[-1],
         "largest distance from the via-point, fitted": float(miss(before).max()),
         "largest distance from the via-point, trained": float(miss(after).max()),
         "least clearance of the sphere, fitted": float(clearance(before).min()),
@@ -72,9 +71,14 @@ def motions(ds: StableDS, y0: Tensor, shown: Demonstration) -> Tensor:
         return ds.rollout(y0, torch.linspace(0, shown.duration, 2000))
 
 
+def distance_from_via(path: Tensor) -> Tensor:
+    """(B, T, n) -> (B, T)."""
+    return torch.linalg.vector_norm(path - torch.tensor(VIA).to(path), dim=-1)
+
+
 def miss(path: Tensor) -> Tensor:
     """Distance of motions from the via-point, where they come nearest: (B, T, n) -> (B,)."""
-    return torch.linalg.vector_norm(path - torch.tensor(VIA).to(path), dim=-1).amin(-1)
+    return distance_from_via(path).amin(-1)
 
 
 def clearance(path: Tensor) -> Tensor:
@@ -99,13 +103,8 @@ def draw_paths(shown: Demonstration, before: Tensor, after: Tensor) -> Figure:
     space.plot(*shown.goal, "*", color="#E69F00", mec=plotting.SHOWN, ms=12, label="goal")
     solid(space, -115)
     seconds = np.linspace(0, shown.duration, before.shape[1])
-    via = torch.tensor(VIA).to(before)
-    for row, (title, distance) in enumerate(
-        {
-            "distance from the sphere": clearance,
-            "distance from the via-point": lambda path: torch.linalg.vector_norm(path - via, dim=-1),
-        }.items()
-    ):
+    panes = (("distance from the sphere", clearance), ("distance from the via-point", distance_from_via))
+    for row, (title, distance) in enumerate(panes):
         axes = figure.add_subplot(panels[row, 1])
         for paths, color in ((before, old), (after, new)):
             axes.plot(seconds, distance(paths[:many]).T, color=color, lw=0.8, alpha=0.6)

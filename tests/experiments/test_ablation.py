@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments import ablation, floor, goals
+from experiments import ablation, report
 from latentds import ChebyshevDS, Demonstration, TubeDS, datasets
 from latentds.benchmark import RolloutProtocol
 from latentds.testing import wavy_motion
@@ -30,47 +30,46 @@ def test_floor_of_an_even_straight_line():
     """Late by a share f of the step h, a point lies f h from one sample and (1-f) h from another: h/4 on average."""
     way = np.linspace(0, 2, 1000)
     shown = Demonstration(np.stack([way, 0 * way], 1), 0.01)
-    assert floor.sampled(shown, RolloutProtocol()) == pytest.approx(2 / 4, rel=0.01)
+    assert ablation.sampling_floor(shown, RolloutProtocol()) == pytest.approx(2 / 4, rel=0.01)
 
 
 def test_joining_a_straight_line():
     """Beside its start the offset dies at κ; behind it, m steps h late, m (m+1)/2 h are lost at either end."""
     way = np.linspace(0, 2, 500)
     shown, kappa = Demonstration(np.stack([way, 0 * way], 1), 0.01), 20.0
-    beside, behind = floor.joined(shown, RolloutProtocol(), np.array([[0, 0.1], [-5 * way[1], 0]]), kappa)
+    beside, behind = ablation.joined_floor(shown, RolloutProtocol(), np.array([[0, 0.1], [-5 * way[1], 0]]), kappa)
     assert beside == pytest.approx(0.1 * np.exp(-kappa * np.linspace(0, 1, 500)).sum(), rel=1e-3)
     assert behind == pytest.approx(5 * 6 * way[1], rel=1e-3)
 
 
 def test_goals_name_what_misses_them():
-    goal = goals.at_most("score", pd.Series({"a": 1.0, "b": 9.0, "c": np.nan}), 8)
+    goal = report.at_most("score", pd.Series({"a": 1.0, "b": 9.0, "c": np.nan}), 8)
     assert goal.met is False
     assert "b 9" in goal.reached
     assert "c nan" in goal.reached
-    assert goals.at_most("score", pd.Series({"a": 1.0}), 8).met
-    assert goals.at_most("score", pd.Series(dtype=float), 8).met is None
+    assert report.at_most("score", pd.Series({"a": 1.0}), 8).met
+    assert report.at_most("score", pd.Series(dtype=float), 8).met is None
 
 
 def test_goals_of_measurements():
     slow, fast = np.array([3.0, 4.0, 5.0]), np.array([1.0, 1.0, 2.0])
-    ratio = goals.ratio("call", 3, slow, fast)
+    ratio = report.ratio("call", 3, slow, fast)
     assert ratio.reached == "4"  # of medians
     assert ratio.quartiles == "2.75 to 3.5"  # round by round
     assert ratio.note == "4 s against 1 s"
     assert ratio.met
-    assert not goals.median("call", "µs", 3.5, slow, at_most=True).met
-    table = goals.table([ratio, goals.Goal("other", "≤ 1", "not measured")])
+    assert not report.median("call", "µs", 3.5, slow, at_most=True).met
+    table = report.goal_table([ratio, report.Goal("other", "≤ 1", "not measured")])
     assert table.splitlines()[0] == "| what | goal | reached | quartiles | unit | met | note |"
     assert table.splitlines()[-1] == "| other | ≤ 1 | not measured |  |  | — |  |"
-    assert (
-        goals.table([goals.Goal("other", "≤ 1", "2", met=False)]).splitlines()[0] == "| what | goal | reached | met |"
-    )
+    alone = report.goal_table([report.Goal("other", "≤ 1", "2", met=False)])
+    assert alone.splitlines()[0] == "| what | goal | reached | met |"
 
 
 def test_every_idea_is_another_setting():
     found = {label: factory(3).settings for label, factory in ablation.variants("unstable c=7").items()}
     assert len({str(settings) + label[:3] for label, settings in found.items()}) == len(found) == 17
-    assert set(ablation.CHOSEN) <= set(found)
+    assert set(ablation.TRIED_EVERYWHERE) <= set(found)
     assert found["TubeDS, straight alone"]["homotopy"] == "linear"
     assert found["TubeDS, unbending alone"]["homotopy"] == "curvature"
     assert found["Chebyshev + both"] == ChebyshevDS(3, n_layers=175, steps=17, refined=True).settings
@@ -97,13 +96,13 @@ def test_a_cell_tells_its_scores_and_costs(tmp_path):
     assert rows[0]["share"] < 0.01
     assert rows[0]["attractor_exact"]
     assert rows[0]["condition_path"] >= 1
-    assert rows[0]["isotopy"] in ("straight", "unbending")
+    assert rows[0]["homotopy"] in ("linear", "curvature", "zoom")
 
 
 def test_a_cell_that_fails_says_so(tmp_path):
     loop = np.linspace(0, 2 * np.pi, 100)
     shown = Demonstration(np.stack([np.cos(loop), np.sin(loop)], 1), 0.01, "loop")
-    (rows,) = rows_of(part(ablation.cell("TubeDS", TubeDS, shown, [shown])), tmp_path)
+    (rows,) = rows_of(part(ablation.cell("TubeDS", TubeDS, shown, judges=[shown])), tmp_path)
     assert rows[0]["status"] == "failed"
     assert "does not meet itself" in rows[0]["error"]
     assert np.isnan(rows[0]["share"])
@@ -113,7 +112,7 @@ def test_a_cell_that_fails_says_so(tmp_path):
 def test_a_rerun_goes_on_where_it_stopped(tmp_path):
     shown = Demonstration(wavy_motion(2).positions, 0.01, "shown")
     few, more = (ablation.cell(f"TubeDS {n}", tube(n), shown) for n in (10, 20))
-    several = ablation.cell("TubeDS", tube(10), [shown, shown], shown)
+    several = ablation.cell("TubeDS", tube(10), [shown, shown], judges=shown)
     (first,) = rows_of(part(few), tmp_path)
     again = rows_of(part(more, few, several), tmp_path)
     assert again[1] == first  # fit seconds and all
@@ -131,7 +130,7 @@ def test_the_summary_tells_every_table(tmp_path):
             "dim": d.dim,
         }
         | {"status": "ok", "error": "", "dtw": 1.0 + start, "share": 1e-3, "mse": 1e-6, "fit_seconds": 0.1}
-        | {"condition_path": 5.0, "attractor_exact": True, "isotopy": "straight"}
+        | {"condition_path": 5.0, "attractor_exact": True, "homotopy": "linear"}
         | {"largest_velocity": 2.0, "largest_gradient": 700.0}
         for p in ablation.parts([spiral], [datasets.joint_motion(0, 60)], {"shape": seven})
         for c in p.cells

@@ -8,13 +8,16 @@ import pytest
 import torch
 import typer
 
-from experiments.methods import GREEDY, RIVALS, greedy
-from experiments.paper import figures, latent_space, tuning, verdicts
+from experiments.compared import GREEDY, RIVALS, greedy
+from experiments.paper import latent_space, tuning
 from experiments.paper.__main__ import main, reproduce
-from experiments.paper.held_out import HeldOut
-from experiments.paper.plan import Plan
+from experiments.paper.document import similar
+from experiments.paper.planes import crossings
+from experiments.paper.sensitivity import Variant
+from experiments.paper.similarity import judge_parameters, judge_similarity
+from experiments.paper.study import Plan
+from experiments.paper.table_two import held_out, held_out_samples
 from experiments.paper.tuning import Grid
-from experiments.paper.variants import Variant
 from experiments.published import Setting
 from latentds import benchmark, datasets
 from latentds.fitting.embedding import chebyshev_eigenvalues
@@ -43,28 +46,32 @@ def test_a_match_begins_with_every_shorter_one(method):
 @pytest.mark.slow
 def test_tuning_tries_the_whole_grid_once_and_is_kept(tmp_path, monkeypatch):
     shown = replace(datasets.unstable_spiral(1, 100), positions=3 * datasets.unstable_spiral(1, 100).positions)
-    grid, more = tuning.Tuner(tmp_path / "optuna.sqlite", 1).greedy("FDM", shown, SMALL)
+    grid, more = tuning.tune("FDM", shown, SMALL, tmp_path / "optuna.sqlite", 1)
     assert sorted((one.beta, one.mu, one.n_layers) for one in grid) == sorted(
         (beta, mu, count) for beta in SMALL.betas for mu in SMALL.mus for count in SMALL.n_layers
     )
     assert len(more) == len(SMALL.n_layers)
     assert grid[0].normalised == pytest.approx(grid[0].mse / 9, rel=1e-2)  # the largest extent is a little below 2
     monkeypatch.setattr(tuning, "trace", None)
-    assert tuning.Tuner(tmp_path / "optuna.sqlite", 1).greedy("FDM", shown, SMALL) == (grid, more)
+    assert tuning.tune("FDM", shown, SMALL, tmp_path / "optuna.sqlite", 1) == (grid, more)
 
 
-def test_sdsef_is_judged_where_it_was_not_trained(monkeypatch):
+def test_sdsef_is_judged_where_it_was_not_trained():
     shown = datasets.unstable_spiral(1, 100)
-    ds = HeldOut(3, n_layers=2, n_features=8, epochs=2)
-    trained = []
-    learn = ds.learner._learn
-    monkeypatch.setattr(ds.learner, "_learn", lambda some, progress: (trained.extend(some), learn(some, progress))[1])
-    ds.fit(shown)
-    assert len(trained[0]) == 70  # 30 of 98 between the ends are held out
-    assert trained[0].duration == pytest.approx(shown.duration)
-    torch.testing.assert_close(ds.attractor, shown.goal)
+    cell = held_out(shown, n_layers=2, n_features=8, epochs=2)
+    (trained_on,) = cell.shown
+    assert len(trained_on) == 70  # 30 of 98 between the ends are held out
+    assert trained_on.duration == pytest.approx(shown.duration)
+    torch.testing.assert_close(trained_on.goal, shown.goal)
+    elsewhere = shown.positions.clone()
+    elsewhere[held_out_samples(100)] += 1
+    unseen = held_out(replace(shown, positions=elsewhere), n_layers=2, n_features=8, epochs=2)
+    assert torch.equal(unseen.shown[0].positions, trained_on.positions)
+    ds = cell.factory(3).fit(trained_on)
     whole = (ds(shown.positions) - shown.velocities).square().mean(1).detach().numpy()
-    assert whole.min() < ds.fit_report.mse < whole.max()
+    error = cell.measure(ds, cell)["test_mse"]
+    assert error == pytest.approx(whole[held_out_samples(100)].mean())
+    assert whole.min() < error < whole.max()
 
 
 @pytest.mark.parametrize("n", [2, 3, 5])
@@ -111,29 +118,29 @@ def test_variants_differ_from_the_method_in_one_thing(method):
     [((1.0,), "reproduced"), ((0.4, 2.9), "reproduced"), ((0.1, 2.9), "better"), ((0.1, 3.1), "worse")],
 )
 def test_figures_within_a_factor_are_reproduced(ratios, verdict):
-    assert verdicts.similar(*ratios) == verdict
+    assert similar(*ratios) == verdict
 
 
 def test_crossings_are_counted_where_they_are():
     s = np.linspace(-1, 1, 51)
     diagonals = np.stack([np.stack([s, s + 0.013], axis=1), np.stack([s, 0.2 - s], axis=1)])
-    np.testing.assert_allclose(figures.crossings(diagonals), [[0.0935, 0.1065]], atol=1e-12)
+    np.testing.assert_allclose(crossings(diagonals), [[0.0935, 0.1065]], atol=1e-12)
     parallel = np.stack([np.stack([s, 0 * s], axis=1), np.stack([s, 0.01 * s], axis=1)])
-    assert len(figures.crossings(parallel)) == 0
+    assert len(crossings(parallel)) == 0
 
 
 def test_the_summary_counts_what_the_lines_say():
     names = [f"unstable c={c}" for c in (1, 3, 7, 15)]
     lines = pd.DataFrame({"spiral": names, "nearer": [True, True, True, False], "lower": [*["Chebyshev"] * 3, "FDM"]})
     lines = lines.assign(fast=[0.04, 0.06, 0.01, 0.01], best=["SDS-EF", "FDM", "Chebyshev", "FDM"])
-    nearer, best = verdicts.similarity(lines)
+    nearer, best = judge_similarity(lines)
     assert nearer[2:] == ("nearer on 3 of 4 spirals, with p < 0.05 on 2", "reproduced")
     assert best[2].startswith("SDS-EF (either recipe) first on 1 of 1 with c ≤ 2, Chebyshev on 1 of 2")
     assert best.verdict == "reproduced in part"
     layers = pd.DataFrame(
         {"Chebyshev": [50, 75], "FDM": [50, 100], "a layer": 7, "SDS-EF": 400, "SDS-EF official": 900}
     )
-    found = verdicts.parameters(layers)
+    found = judge_parameters(layers)
     assert (
         "fewer layers than FDM on 1, as many on 1, more on 0 spirals; fewer parameters than SDS-EF on 1 of 2"
         in found.ours
