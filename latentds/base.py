@@ -1,4 +1,7 @@
-"""The one interface of every method: a globally asymptotically stable system that is learned and rolled out."""
+"""The one interface of every method: a globally asymptotically stable system that is learned and rolled out.
+
+One file, though long: every system makes moved ones of itself, and a moved one is a system.
+"""
 
 from __future__ import annotations
 
