@@ -8,16 +8,13 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from latentds.arguments import whole_number
+from latentds.arguments import Array, whole_number
 from latentds.base import Learned
 from latentds.demonstration import Demonstration
 
 from .phase import PhaseDriven, refuse_closed
-
-Array = NDArray[np.float64]
 
 STIFFNESS = 25.0
 """α_z; β_z = α_z / 4 makes the spring critically damped, and its double rate is α_z / 2."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from latentds.arguments import Array
 from latentds.demonstration import Demonstration
 from latentds.fitting.embedding import map_to_endpoints, straight_column
 from latentds.methods.greedy import GreedyDS
@@ -18,7 +16,7 @@ class FDM(GreedyDS):
     """
 
     @staticmethod
-    def latent_line(shown: Demonstration) -> NDArray[np.float64]:
+    def latent_line(shown: Demonstration) -> Array:
         return map_to_endpoints(straight_column(len(shown)), shown.start.numpy(), shown.goal.numpy())
 
     @staticmethod

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from latentds.arguments import whole_number
+from latentds.arguments import Array, whole_number
 from latentds.resizing import assign, make_room
 
 from .couplings import no_autocast
@@ -19,8 +18,6 @@ from .mixture import GaussianMixture, drawn_seed, scikit_learn
 from .networks import NormalizedDS, thinned
 from .pooling import Pool
 from .training import Training
-
-Array = NDArray[np.float64]
 
 LEAST_RATE = 0.1
 """Least rate at which √V falls, per duration of the demonstration."""

@@ -8,15 +8,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from latentds.arguments import check_points, whole_number
+from latentds.arguments import Array, check_points, whole_number
 from latentds.resizing import assign, make_room
 
 from .pooling import Pool
-
-Array = NDArray[np.float64]
 
 MOST_COMPONENTS = 12
 """How many the Bayesian information criterion may choose from."""

@@ -9,11 +9,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from torch import Tensor, nn
+
+from latentds.arguments import Array
 
 MAX_RECOVERIES = 25
 
@@ -162,11 +162,11 @@ def descend_smoothly(
     sizes = [p.numel() for p in moved]
     steps = torch.cat([torch.full((p.numel(),), step, dtype=p.dtype) for p, step in parameters.items()])
 
-    def assign(flat: NDArray[np.float64]) -> None:
+    def assign(flat: Array) -> None:
         values = torch.split(torch.from_numpy(flat) * steps, sizes)
         _copy(moved, [value.view_as(p) for value, p in zip(values, moved, strict=True)])
 
-    def evaluate(flat: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    def evaluate(flat: Array) -> tuple[float, Array]:
         assign(flat)
         with torch.enable_grad():
             value = loss()

@@ -10,11 +10,9 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Mu
 from contextlib import closing, contextmanager, nullcontext
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import nn
 
-from .arguments import whole_number
+from .arguments import Array, whole_number
 from .cache import CellStore, UnreadableError, fingerprint
 from .cell import COLUMNS, Cell, Factory, Outcome, RolloutProtocol, build, evaluate, reproducible_torch, several
 from .demonstration import Demonstration
@@ -22,7 +20,7 @@ from .demonstration import Demonstration
 if TYPE_CHECKING:
     import pandas as pd
 
-Paths = MutableMapping[tuple[str, str, int], NDArray[np.float64]]
+Paths = MutableMapping[tuple[str, str, int], Array]
 """{(method, demonstration, seed): rollouts (starts, n_points, n)}."""
 
 __all__ = ["COLUMNS", "Cell", "Factory", "Outcome", "Paths", "RolloutProtocol", "compare", "evaluate", "run", "table"]

@@ -25,8 +25,9 @@ from typing import Any
 import numpy as np
 import torch
 from numba.extending import is_jitted
-from numpy.typing import NDArray
 from torch import Tensor
+
+from .arguments import Array
 
 Rows = tuple[dict[str, Any], ...]
 
@@ -87,7 +88,7 @@ class CellStore:
     def keys(self) -> set[str]:
         return {key for (key,) in self._execute("SELECT key FROM cells")}
 
-    def get(self, key: str) -> tuple[Rows, NDArray[np.float64]] | None:
+    def get(self, key: str) -> tuple[Rows, Array] | None:
         """The rows and rollouts of a cell, or None if it was not finished."""
         cells = self._execute("SELECT rows, paths, digest FROM cells WHERE key = ?", (key,))
         if not cells:
@@ -97,7 +98,7 @@ class CellStore:
             raise self._refusal("a damaged cell")
         return tuple(json.loads(rows)), np.load(io.BytesIO(paths), allow_pickle=False)
 
-    def put(self, key: str, rows: Rows, paths: NDArray[np.float64]) -> None:
+    def put(self, key: str, rows: Rows, paths: Array) -> None:
         """Keep a finished cell; the first to come stays."""
         packed = io.BytesIO()
         np.save(packed, paths, allow_pickle=False)

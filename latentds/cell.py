@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from . import kernels, metrics
-from .arguments import number_in, whole_number
+from .arguments import Array, number_in, whole_number
 from .base import StableDS
 from .demonstration import Demonstration
 from .fidelity import FitWarning
@@ -75,7 +75,7 @@ class RolloutProtocol:
         """(n_points,) seconds."""
         return torch.linspace(0, demonstration.duration, self.n_points, dtype=torch.float64)
 
-    def reference(self, demonstration: Demonstration) -> NDArray[np.float64]:
+    def reference(self, demonstration: Demonstration) -> Array:
         """The demonstration at :meth:`times`, (n_points, n)."""
         return demonstration.at(self.times(demonstration).numpy())
 
@@ -150,7 +150,7 @@ class Outcome:
     demonstration: str
     seed: int
     rows: tuple[dict[str, Any], ...]
-    paths: NDArray[np.float64]
+    paths: Array
 
     @property
     def name(self) -> tuple[str, str, int]:
@@ -248,7 +248,7 @@ def _outcome(
     of_judge: Sequence[Mapping[str, float]] = (),
     follows: bool = False,
     converged: NDArray[np.bool_] | None = None,
-    paths: NDArray[np.float64] | None = None,
+    paths: Array | None = None,
     error: Exception | None = None,
 ) -> Outcome:
     """The rows of a cell; NaN stands for what is missing because of an error."""
@@ -303,7 +303,7 @@ def _facts(ds: StableDS) -> dict[str, float]:
     }
 
 
-def _scores(path: NDArray[np.float64], reference: NDArray[np.float64]) -> dict[str, float]:
+def _scores(path: Array, reference: Array) -> dict[str, float]:
     exact, fast = metrics.dtw(path, reference), metrics.fast_dtw(path, reference)
     return {
         "dtw": exact,

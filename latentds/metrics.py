@@ -11,12 +11,10 @@ from typing import Any
 
 import numpy as np
 from fastdtw import fastdtw
-from numpy.typing import NDArray
 
-from .arguments import number_in, real_array, whole_number
+from .arguments import Array, number_in, real_array, whole_number
 from .kernels.compiling import cached
 
-Array = NDArray[np.float64]
 NAN = math.nan
 
 

@@ -14,9 +14,8 @@ from zlib import crc32
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from .arguments import number_in, real_array
+from .arguments import Array, number_in, real_array
 from .base import StableDS
 from .demonstration import Demonstration
 
@@ -28,8 +27,6 @@ except ImportError as error:
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Array = NDArray[np.float64]
 
 # Okabe and Ito's palette, told apart by colour-blind readers.
 COLORS = {"Chebyshev": "#0072B2", "FDM": "#D55E00", "SDS-EF": "#009E73", "Tube": "#CC79A7", "TubeDS": "#CC79A7"}

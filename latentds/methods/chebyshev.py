@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ..arguments import Array
 from ..demonstration import Demonstration
 from ..fitting.embedding import chebyshev_columns, map_to_endpoints
 from ..time_law import ChebyshevLaw
@@ -21,7 +19,7 @@ class ChebyshevDS(GreedyDS):
     """
 
     @staticmethod
-    def latent_line(shown: Demonstration) -> NDArray[np.float64]:
+    def latent_line(shown: Demonstration) -> Array:
         columns = chebyshev_columns(len(shown), shown.dim)[::-1]
         return map_to_endpoints(columns, shown.start.numpy(), shown.goal.numpy())
 

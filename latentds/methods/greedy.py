@@ -5,11 +5,9 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from ..arguments import number_in, whole_number
+from ..arguments import Array, number_in, whole_number
 from ..base import LatentDS, Learned
 from ..demonstration import Demonstration, goal_apart, only_one
 from ..dynamics import RayDynamics
@@ -72,7 +70,7 @@ class GreedyDS(LatentDS):
 
     @staticmethod
     @abstractmethod
-    def latent_line(shown: Demonstration) -> NDArray[np.float64]:
+    def latent_line(shown: Demonstration) -> Array:
         """Where the latent point of each demonstrated one lies, from start to goal: (N, n)."""
 
     @staticmethod
@@ -99,9 +97,7 @@ class GreedyDS(LatentDS):
         self._refuse_folds(motion)
         return Learned(float(missed.square().mean()), psi.n_layers, notes=notes)
 
-    def _hyperparameters(
-        self, latent: NDArray[np.float64], points: NDArray[np.float64]
-    ) -> tuple[int, float, float, tuple[str, ...]]:
+    def _hyperparameters(self, latent: Array, points: Array) -> tuple[int, float, float, tuple[str, ...]]:
         """M, β and μ, and a note of those that were not given."""
         if self.n_layers is not None:
             return self.n_layers, self.beta, self.mu, ()

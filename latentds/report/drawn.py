@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arguments import real_array
+from ..arguments import Array, real_array
 from ..demonstration import Demonstration
-from .comparison import Array, Comparison, Motion
+from .comparison import Comparison, Motion
 
 ROOM = 900_000
 """Bytes of a file that rollouts may take, beside the 5 MB of Plotly: they are thinned to that."""
