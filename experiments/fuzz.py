@@ -121,7 +121,10 @@ class Case(NamedTuple):
     def positions(self) -> Any:
         """The motion, (N, n), in the form that it is handed over in."""
         draw = np.random.default_rng(self.seed)
-        path = self.scale * _flawed(_path(self.shape, self.n_points, self.dim, draw), self.flaw, draw) + self.offset
+        path = _path(self.shape, self.n_points, self.dim, draw)
+        if self.flaw not in FLAWS:
+            raise ValueError(f"flaw: expected one of {(*FLAWS,)}, got {self.flaw!r}")
+        path = self.scale * FLAWS[self.flaw](path, len(path) // 2, draw) + self.offset
         with np.errstate(over="ignore", invalid="ignore"):
             return FORMS[self.form](path)
 
@@ -145,12 +148,6 @@ def _spiral(radius: Array | float, angle: Array) -> tuple[Array, Array]:
 def _loop_the_loop(t: Array, apart: float) -> tuple[Array, ...]:
     angle = 2 * np.pi * np.clip(3 * t - 1, 0, 1)
     return 3 * t + np.sin(angle), 1 - np.cos(angle), apart * t
-
-
-def _flawed(path: Array, flaw: str, draw: Draw) -> Array:
-    if flaw not in FLAWS:
-        raise ValueError(f"flaw: expected one of {(*FLAWS,)}, got {flaw!r}")
-    return FLAWS[flaw](path, len(path) // 2, draw)
 
 
 def _with(path: Array, where: Any, value: Any) -> Array:

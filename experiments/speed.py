@@ -67,10 +67,8 @@ def products(buffer: Array, repeats: int) -> None:
     store(buffer, 0, a + b + c + d + e + f + g + h + i + j + k + n)
 
 
-def operations(dim: int) -> int:
-    """Vector operations of a layer beside its exponential: x - c, the squared length, times ρ², and x + k v."""
-    return dim + dim + 1 + dim
-
+OPERATIONS = 3 + 3 + 1 + 3
+"""Vector operations of a layer at n = 3 beside its exponential: x - c, the squared length, times ρ², and x + k v."""
 
 # --- the calls as one writes them first, in loops of torch ------------------------------------------------------------
 
@@ -189,10 +187,10 @@ def against_floor(ds: ChebyshevDS, rounds: int) -> list[Goal]:
     times = take_turns({"decode": partial(ds.decode, x), **floors}, rounds)
     each_exp = times["exponentials"] / repeats / BLOCK
     each_product = times["products"] / repeats / 12 / WIDTH
-    floor = (each_exp + operations(3) * each_product) * N_LAYERS * len(x)
+    floor = (each_exp + OPERATIONS * each_product) * N_LAYERS * len(x)
     note = (
         f"floor {np.median(floor) / N_LAYERS / len(x) * 1e9:.2f} ns a layer and point: exponential "
-        f"{np.median(each_exp) * 1e9:.2f} ns, {operations(3)} operations of {np.median(each_product) * 1e9:.3f} ns"
+        f"{np.median(each_exp) * 1e9:.2f} ns, {OPERATIONS} operations of {np.median(each_product) * 1e9:.3f} ns"
     )
     above = report.median("decode 10⁵ points", "times the floor", 2.5, times["decode"] / floor, at_most=True, note=note)
     loop = partial(forward_loop, layers, x)
