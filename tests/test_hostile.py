@@ -19,14 +19,26 @@ from latentds.testing import wavy_motion
 
 
 @pytest.mark.slow
-@seeded(7)
-@settings(
-    max_examples=25, deadline=None, database=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck)
-)
-@given(cases(largest=200))
-def test_hostile_demonstrations(case):
-    found = outcome(case)
-    assert not found.startswith("BROKEN"), f"{case}: {found}"
+@pytest.mark.parametrize("name", METHODS)
+def test_hostile_demonstrations(name):
+    """The first few of the thousand that `make fuzz` tries, by every method."""
+    ends = []
+
+    @seeded(7)
+    @settings(
+        max_examples=3 if name == SLOW else 12,
+        deadline=None,
+        database=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(cases(largest=100))
+    def attempt(case):
+        ends.append(outcome(case._replace(method=name)))
+        assert not ends[-1].startswith("BROKEN"), f"{case}: {ends[-1]}"
+
+    attempt()
+    assert {FOLLOWS, SAYS} & set(ends)  # not all are refused
 
 
 PLAIN = Case("FDM", "smooth", "none", "float64", 100, 2, 1.0, 0.0, 0.01, 0)
@@ -43,11 +55,19 @@ def test_harmless_demonstrations_are_fitted(name):
         assert outcome(PLAIN._replace(method=name, dim=dim)) == FOLLOWS
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", METHODS)
-@pytest.mark.parametrize("form", ["float32", "float16", "strided", "transposed", "requires_grad", "numpy", "list"])
-def test_every_form_is_taken(name, form):
-    assert outcome(PLAIN._replace(method=name, form=form)) == FOLLOWS
+@pytest.mark.parametrize("form", ["float32", "strided", "transposed", "requires_grad", "numpy", "list"])
+def test_every_form_is_the_same_motion(form):
+    """So every method is fitted to the same numbers, whatever they came in."""
+    numbers = torch.from_numpy(PLAIN._replace(form="numpy").positions())
+    shown = Demonstration(PLAIN._replace(form=form).positions(), PLAIN.dt)
+    assert shown.positions.dtype == torch.float64
+    assert not shown.positions.requires_grad
+    assert torch.equal(shown.positions, numbers.float().double() if form == "float32" else numbers)
+
+
+@pytest.mark.parametrize("name", FITTED)
+def test_what_a_coarse_form_rounds_is_followed(name):
+    assert outcome(PLAIN._replace(method=name, form="float16")) == FOLLOWS
 
 
 @pytest.mark.parametrize("name", FITTED)
