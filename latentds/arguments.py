@@ -36,8 +36,10 @@ def number_in(value: Any, name: str, low: float, high: float, *, ends: str = "()
 def real_tensor(values: Any, name: str) -> Tensor:
     """``values`` as a tensor of whatever real dtype and device they have; never a copy of a tensor."""
     try:
+        if isinstance(values, np.ndarray) and (min(values.strides, default=0) < 0 or not values.dtype.isnative):
+            values = values.astype(values.dtype.newbyteorder("="), order="C")  # reversed, or of another byte order
         tensor = torch.as_tensor(values)
-        if tensor.is_complex() or tensor.dtype == torch.bool:
+        if tensor.is_complex() or tensor.dtype == torch.bool or tensor.layout != torch.strided:
             raise TypeError
     except (TypeError, ValueError, RuntimeError):
         raise ValueError(f"{name}: expected an array of real numbers, got {_describe(values)}") from None

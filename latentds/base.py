@@ -32,7 +32,7 @@ from .fidelity import EXCERPT_POINTS, ROUNDING_LIMIT, Excerpt, Fidelity, FitWarn
 from .files import write_tensors
 from .integrate import integrate
 from .kernels.dispatch import no_active_transforms
-from .kernels.private import tensors_of
+from .kernels.private import is_altered, tensors_of
 from .memo import Memo
 from .probes import restart_gap, round_trip_gap
 from .similarity import Similarity, check_rotation
@@ -305,10 +305,13 @@ class StableDS(nn.Module, ABC):
         Atomic: the file is there whole or not at all.
 
         Raises:
-            ValueError: if a setting is no number, string, boolean, None or system, if the report is not of
-                ``report_type``, or if something other than a regular file is at ``path``.
+            ValueError: if the system holds NaN or inf, if a setting is no number, string, boolean, None or system, if
+                the report is not of ``report_type``, or if something other than a regular file is at ``path``.
         """
         header, report = {"format": FORMAT} | _class_and_settings(self), self.fit_report
+        for name, tensor in self.state_dict().items():
+            if not bool(torch.isfinite(tensor).all()):
+                raise ValueError(f"ds: expected finite numbers, got NaN or inf in {name}")
         if report is not None and type(report) is not self.report_type:
             raise ValueError(
                 f"ds: expected a fit_report of report_type {self.report_type.__name__}, got {type(report).__name__}"
@@ -375,7 +378,7 @@ class StableDS(nn.Module, ABC):
     @staticmethod
     def _with_exact_start(y0: Any, path: Tensor) -> Tensor:
         """``path`` (..., T, n) with ``y0`` itself, not what rounding made of it, as its first point."""
-        start = torch.as_tensor(y0).to(path.dtype)
+        start = real_tensor(y0, "y0").to(path.dtype)
         return torch.cat([start.unsqueeze(-2), path[..., 1:, :]], dim=-2)
 
 
@@ -555,7 +558,7 @@ class LatentDS(StableDS):
         return error
 
     def tables(self) -> FieldTables | None:
-        if type(self).forward is not LatentDS.forward:
+        if type(self).forward is not LatentDS.forward or is_altered(self):
             return None  # a subclass whose velocity is another one must say itself how to write it
         exact = copy.deepcopy(self).to("cpu", torch.float64)
         return field_tables(exact.diffeomorphism, exact.dynamics, exact.frame())
@@ -644,7 +647,7 @@ class MovedDS(StableDS):
         return self._with_exact_start(y0, self._outside(path).to(wanted))
 
     def tables(self) -> FieldTables | None:
-        inside = self.ds.tables()
+        inside = None if is_altered(self) else self.ds.tables()
         return None if inside is None else self.similarity.tables(inside, self.ds.attractor, self.attractor)
 
     def surroundings(self, ball: Tensor) -> Tensor | None:

@@ -14,6 +14,7 @@ from torch import Tensor
 from .arguments import real_array, whole_number
 from .base import LatentDS, MovedDS, StableDS
 from .fidelity import FLOW_GAP_LIMIT, NEARBY_STARTS, ROUNDING_LIMIT, Excerpt, measure
+from .kernels.private import is_altered
 from .probes import flow_gap, jacobian_gap, restart_gap, round_trip_gap
 
 Verdict = Literal["proven", "not falsified", "falsified"]
@@ -149,6 +150,8 @@ class _Search:
 
     def lines(self) -> list[Line]:
         lines, inside = [self._finite()], self.ds
+        if lines[0].verdict == "falsified":
+            return lines
         while isinstance(inside, MovedDS):
             inside = inside.ds
         if isinstance(inside, LatentDS):
@@ -156,8 +159,6 @@ class _Search:
         if isinstance(self.ds, LatentDS):
             lines += [self._rate(self.ds)]
         lines += [self._attractor()]
-        if lines[0].verdict == "falsified":
-            return lines
         with torch.no_grad():
             self.paths = self.ds.rollout(self.starts, self.times)
         if isinstance(self.ds, LatentDS):
@@ -189,7 +190,7 @@ class _Search:
                 farthest = torch.maximum((box[0] - goal).abs(), (box[1] - goal).abs()).unsqueeze(0)
             radius = float(torch.linalg.vector_norm(farthest, dim=-1).max())
             bound = ds.dynamics.convergence_rate_bound(radius, frame)
-            if bound is not None and 0 < bound < math.inf:
+            if bound is not None and 0 < bound < math.inf and not is_altered(ds.dynamics):
                 return Line(claim, "proven", 1, bound, f"least rate {where}, per second:")
             x = torch.cat([x, ds.latent_motion(self.starts, self.times).flatten(0, 1)])
             x = x[(x != goal).any(-1)]
@@ -242,14 +243,43 @@ class _Search:
         claim = "ψ neither folds nor flattens space"
         return self._judge(claim, badness, limit, "cond(J)", points)
 
+    def _pace(self, y: Tensor) -> Tensor:
+        """f(y)/‖y - y*‖, per duration: dividing takes the attractor itself away from those who look for zeros."""
+        offset = torch.linalg.vector_norm(y - self.goal, dim=-1, keepdim=True)
+        paced: Tensor = self.ds(y) / offset.clamp(min=1e-9 * self.size) * self.duration
+        return paced
+
+    def _slowest_on_the_way(self) -> tuple[Tensor, Tensor]:
+        """Where motions are slowest for how far they have to go, and how slow: (B, n) and (B,).
+
+        A field may stand still on a line that a rollout, which takes steps, has stepped over. So the few slowest places
+        of each motion are narrowed down, by golden sections of the steps before and after them.
+        """
+        ratio = (5**0.5 - 1) / 2
+
+        def speed(y: Tensor) -> Tensor:
+            speeds: Tensor = torch.linalg.vector_norm(self._pace(y), dim=-1).nan_to_num(nan=0.0)
+            return speeds
+
+        later = torch.logspace(-2, math.log10(ARRIVES_WITHIN), N_TIMES - 1, dtype=torch.float64)
+        paths = self.ds.rollout(self.starts, self.duration * torch.cat([torch.zeros(1), later]).to(self.times))
+        inner = speed(paths[:, 1:-1])
+        place = inner.topk(min(4, inner.shape[1]), dim=-1, largest=False).indices + 1
+        row = torch.arange(len(paths), device=place.device).unsqueeze(-1)
+        middle = paths[row, place]
+        low, high = (
+            torch.cat(parts).flatten(0, 1)
+            for parts in ([paths[row, place - 1], middle], [middle, paths[row, place + 1]])
+        )
+        for _ in range(70):
+            left, right = high + ratio * (low - high), low + ratio * (high - low)
+            first = (speed(left) < speed(right)).unsqueeze(-1)
+            low, high = torch.where(first, low, left), torch.where(first, right, high)
+        return low, speed(low)
+
     def _equilibria(self) -> Line:
-        """Damped Newton steps on f(y)/‖y - y*‖ = 0; dividing takes the attractor itself away from the solver."""
-
-        def pace(y: Tensor) -> Tensor:
-            offset = torch.linalg.vector_norm(y - self.goal, dim=-1, keepdim=True)
-            paced: Tensor = self.ds(y) / offset.clamp(min=1e-9 * self.size) * self.duration
-            return paced
-
+        """Damped Newton steps on f(y)/‖y - y*‖ = 0 from the samples, and the slowest places of motions."""
+        pace = self._pace
         lengths = torch.tensor([2.0, 1.0, 0.3]).to(self.points).view(-1, 1, 1, 1)  # 2 is right for a double root
         damping = torch.tensor([1e-12, 1e-4, 1e-2, 1.0]).to(self.points).view(-1, 1, 1)
         nudge = 1e-3 * self.tolerance**0.5 * self.size
@@ -268,8 +298,9 @@ class _Search:
                 best = left_over.argmin(0)
                 rows = left_over.amin(0).argsort()[: max(32, len(y) // 2)]  # give up the worse half at every step
                 y = trials[best, torch.arange(len(y))][rows]
-            every = torch.cat([self.points, y])
-            relative = torch.cat([relative, left_over.amin(0)[rows]])
+            slow, slowness = self._slowest_on_the_way()
+            every = torch.cat([self.points, y, slow])
+            relative = torch.cat([relative, left_over.amin(0)[rows], slowness])
         away = torch.linalg.vector_norm(every - self.goal, dim=-1) > 1e-4 * self.size
         # Still moving: the limit is far beyond any pause that a fit leaves in a motion.
         durations, claim = 1 / relative[away], "no equilibrium but the attractor"
@@ -396,6 +427,10 @@ def _region(ds: StableDS, region: Any, generator: torch.Generator) -> Tensor:
         raise ValueError(f"region: expected (2, {ds.dim}) corners, as {type(ds).__name__} implies none, got None")
     points = torch.cat([around, ds.attractor.unsqueeze(0)]).detach().cpu().double()
     points = points[torch.isfinite(points).all(-1)]
+    if len(points) <= 1:  # a system with NaN: where it was shown, it is to be found out
+        points = torch.tensor(
+            [row for one in ds.excerpts() for row in one.path] or points.tolist(), dtype=torch.float64
+        )
     if not bool((points != points[:1]).any()):
         raise ValueError(
             f"region: expected (2, {ds.dim}) corners, as the latent ball of {type(ds).__name__} implies none, got None"

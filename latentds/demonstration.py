@@ -228,7 +228,7 @@ def demonstrations_of(demonstration: Any, dim: int) -> list[Demonstration]:
     if not isinstance(shown, Sequence) or not shown or not all(isinstance(d, Demonstration) for d in shown):
         raise ValueError(
             "demonstration: expected a Demonstration or a non-empty list of them, "
-            f"got {type(demonstration).__name__}" + (" (empty)" if shown in ([], ()) else "")
+            f"got {type(demonstration).__name__}" + (" (empty)" if isinstance(shown, Sequence) and not shown else "")
         )
     for item in shown:
         if item.dim != dim:

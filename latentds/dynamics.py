@@ -80,7 +80,7 @@ class RayDynamics(LatentDynamics):
         offset = (x - frame.attractor).unsqueeze(-2)
         return frame.attractor + _remaining_share(self.law, _norm_above_zero(offset / frame.length), t) * offset
 
-    def convergence_rate_bound(self, radius: float, frame: Frame) -> float:
+    def convergence_rate_bound(self, radius: float, frame: Frame) -> float | None:
         length = float(frame.length)
         return self.law.convergence_rate_bound(radius / length) if length > 0 else -math.inf
 
@@ -113,14 +113,15 @@ class TubeDynamics(LatentDynamics):
         aside = _remaining_share(self.transverse_law, _norm_above_zero(across), t) * across
         return frame.attractor + frame.length * (ahead + aside)
 
-    def convergence_rate_bound(self, radius: float, frame: Frame) -> float:
+    def convergence_rate_bound(self, radius: float, frame: Frame) -> float | None:
         length, dtype = float(frame.length), frame.axis.dtype
         norm = float(torch.linalg.vector_norm(frame.axis.to(torch.float64)))
         # The part across a longer axis would push back along it.
         if not (length > 0 and (norm == 0 or abs(norm - 1) <= 8 * torch.finfo(dtype).eps)):
             return -math.inf
         reach = radius / length
-        return min(self.law.convergence_rate_bound(reach), self.transverse_law.convergence_rate_bound(reach))
+        along, across = (law.convergence_rate_bound(reach) for law in (self.law, self.transverse_law))
+        return None if along is None or across is None else min(along, across)
 
     def phase(self, x: Tensor, frame: Frame) -> Tensor:
         """s, 1 at the demonstrated start and 0 at x*: (..., n) -> (...)."""

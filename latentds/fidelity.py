@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .arguments import Array, number_in, point_array, positive
-from .curves import extent, jitter
+from .curves import extent, interpolated, jitter
 from .demonstration import Demonstration
 from .metrics import dtw, endpoint_error, path_length, path_length_ratio
 from .probes import flow_gap, largest_rise, restart_gap, unit_ball
@@ -35,6 +35,9 @@ anew half-way, bring encode(decode(x)) so many latent lengths off x. Sound syste
 FLOW_GAP_LIMIT = 0.02
 """Distance of a rollout from the integral of the velocity field, in sizes; sound fits stay below
 a third of it."""
+
+TIMING_LIMIT = 0.05
+"""Mean distance from the demonstration at equal times, in sizes: neither DTW nor a length sees too fast a motion."""
 
 NEARBY_STARTS = 8
 """Motions from nearby starts."""
@@ -125,9 +128,12 @@ class Fidelity:
         restart_gap: largest distance of the motion from the same one begun anew half-way, in sizes.
         flow_gap: largest distance, in sizes, of that motion and of two from beside its start from the integral of the
             velocity field, which is what a robot runs.
+        timing: mean distance of that motion from the demonstration at equal times, in sizes, after the best shift by up
+            to a tenth of the duration, as one that starts to move a little later. Of several demonstrations, which one
+            system cannot all keep the times of, each counts in the mean of their durations.
         latent_error: see :meth:`~latentds.LatentDS.latent_error`; 0 for a system without latent space.
-        spread: of several demonstrations, how far they miss each other: as ``miss``, each and the next. Nobody can
-            follow all of them more closely, so it is added to what ``miss``, ``end`` and ``nearby`` may be.
+        spread: of several demonstrations, the largest distance of a goal from the mean of their goals, in sizes. One
+            attractor cannot be nearer to all of them, so it is added to what ``end`` may be.
         shown: what it was held against.
     """
 
@@ -139,6 +145,7 @@ class Fidelity:
     rise: float
     restart_gap: float
     flow_gap: float = 0.0
+    timing: float = 0.0
     latent_error: float = 0.0
     spread: float = 0.0
     shown: tuple[Excerpt, ...] = field(default=(), repr=False)
@@ -156,20 +163,19 @@ class Fidelity:
     @property
     def findings(self) -> tuple[tuple[float, str], ...]:
         """Each figure over its limit, and in words."""
-        allowed = self.spread
         folded = math.inf if not self.length_ratio > 0 else self.length_ratio
         figures = (
-            (self.miss / (MISS_LIMIT + allowed), f"misses its demonstration by {self.miss:.3g} of the size"),
+            (self.miss / MISS_LIMIT, f"misses its demonstration by {self.miss:.3g} of the size"),
             (
                 max(folded / LARGEST_LENGTH_RATIO, LEAST_LENGTH_RATIO / folded),
                 f"moves {self.length_ratio:.3g} times as far as its demonstration",
             ),
             (
-                self.end / (END_LIMIT + allowed),
+                self.end / (END_LIMIT + self.spread),
                 f"is {self.end:.3g} of the size from the end when the demonstration ends",
             ),
             (
-                self.nearby / (NEARBY_LIMIT + allowed),
+                self.nearby / NEARBY_LIMIT,
                 f"misses by {self.nearby:.3g} of the size from a start beside the demonstrated one",
             ),
             (
@@ -180,6 +186,10 @@ class Fidelity:
             (
                 self.restart_gap / ROUNDING_LIMIT,
                 f"its motion begun anew half-way is another one, {self.restart_gap:.3g} sizes away",
+            ),
+            (
+                self.timing / TIMING_LIMIT,
+                f"is {self.timing:.3g} of the size from where its demonstration is at the same time, on average",
             ),
             (
                 self.flow_gap / FLOW_GAP_LIMIT,
@@ -211,19 +221,30 @@ def measure(ds: System, shown: Sequence[Excerpt]) -> Fidelity:
     ball = unit_ball(PLACES_BESIDE, dim, draw)
     paths = [np.array(one.path) for one in shown]
     duration = max(one.duration for one in shown)
+    mean = float(np.mean([one.duration for one in shown]))
     every = [
-        _measure(ds, one, path, duration, around[i :: len(shown)], ball[i :: len(shown)])
+        _measure(ds, one, path, duration, mean / one.duration, around[i :: len(shown)], ball[i :: len(shown)])
         for i, (one, path) in enumerate(zip(shown, paths, strict=True))
     ]
     figures = {name: float(np.max([one[name] for one in every])) for name in every[0]}
     ratios = [one["length_ratio"] for one in every]
     figures["length_ratio"] = max(ratios, key=lambda ratio: abs(math.log(ratio)) if ratio > 0 else math.inf)
-    pairs = zip(paths, paths[1:] + paths[:1], strict=True) if len(paths) > 1 else ()
-    spread = [dtw(a, b) / max(len(a), len(b)) / extent(b) for a, b in pairs]
-    return Fidelity(**figures, spread=float(np.mean(spread)) if spread else 0.0, shown=tuple(shown))
+    goals = np.stack([path[-1] for path in paths])
+    spread = np.linalg.norm(goals - goals.mean(0), axis=1) / [extent(path) for path in paths]
+    return Fidelity(**figures, spread=float(spread.max()), shown=tuple(shown))
 
 
-def _measure(ds: System, one: Excerpt, path: Array, duration: float, around: Array, ball: Array) -> dict[str, float]:
+def _timing_gap(motion: Array, lasts: float, path: Array, duration: float) -> float:
+    """Mean distance at equal times after the best shift of a motion that ``lasts`` so many seconds."""
+    times, clock = np.linspace(0, duration, len(path)), np.linspace(0, lasts, len(motion))
+    shifts = duration * np.linspace(-0.1, 0.1, 21)
+    later = interpolated(times + shifts[:, None], clock, motion)
+    return float(np.linalg.norm(later - path, axis=-1).mean(-1).min())
+
+
+def _measure(
+    ds: System, one: Excerpt, path: Array, duration: float, pace: float, around: Array, ball: Array
+) -> dict[str, float]:
     size, count = extent(path), len(path)
     distance = np.linalg.norm(path - path[0], axis=1)
     away = np.argmax(distance > 2 * NEARBY_DISTANCE * size)
@@ -244,6 +265,7 @@ def _measure(ds: System, one: Excerpt, path: Array, duration: float, around: Arr
         "end": endpoint_error(motions[0], path) / size,
         "nearby": float(np.max(missed[1:], initial=0.0)),
         "fastest": float(torch.linalg.vector_norm(velocity, dim=-1).max()) / one.fastest,
+        "timing": _timing_gap(motions[0], duration, path, pace * one.duration) / size,
         "rise": float(largest_rise(energy)),
         "restart_gap": float(restart_gap(ds, moved[0], times)) / size,
         "flow_gap": float(flow_gap(ds, starts[:3], times).max()) / size,

@@ -13,18 +13,24 @@ from .arguments import Array
 class Tabulated:
     """Something that can say its formula in numbers, by :meth:`table`.
 
-    A class says so of itself alone. A subclass may compute something else, which readers of its parent's numbers would
-    not notice; so a subclass that does not define ``table`` has none, whatever its parents say.
+    A class says so of itself alone, and of how fast it converges likewise. A subclass may compute something else, which
+    readers of its parent's numbers would not notice; so one that does not define ``table`` has none, and one that does
+    not define ``convergence_rate_bound`` proves none, whatever its parents say.
     """
 
     def table(self, *args: Any, **keywords: Any) -> Any:
         """None: compiled code cannot compute this."""
         return None
 
+    def convergence_rate_bound(self, *args: Any, **keywords: Any) -> Any:
+        """None: nothing is proven."""
+        return None
+
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
-        if "table" not in vars(cls):
-            cls.table = Tabulated.table  # type: ignore[method-assign]
+        for name in ("table", "convergence_rate_bound"):
+            if name not in vars(cls):
+                setattr(cls, name, getattr(Tabulated, name))
 
 
 class LawKind(IntEnum):

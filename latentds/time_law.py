@@ -37,9 +37,9 @@ class TimeLaw(Tabulated, nn.Module, ABC):
     def progress_at(self, time: Tensor) -> Tensor:
         """The inverse of :meth:`time_to_go`."""
 
-    @abstractmethod
-    def convergence_rate_bound(self, reach: float) -> float:
-        """The least h(s)/s over 0 < s <= ``reach``, per second; not above 0 if the numbers make no law."""
+    def convergence_rate_bound(self, reach: float) -> float | None:
+        """The least h(s)/s over 0 < s <= ``reach``, per second: None if unknown, not above 0 if the law is none."""
+        return None
 
     def table(self) -> LawTable | None:
         """The law as numbers, as it is now; None if compiled code cannot compute it."""

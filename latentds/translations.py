@@ -141,10 +141,11 @@ class LocallyWeightedTranslations(Diffeomorphism):
     @eager_for_derivatives
     def linearize(self, y: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         check_points(self.dim, y, "y")
-        if not translations.can_use_kernel(self, y):
+        held = self._for_kernels(y)
+        if held is None:
             x = self.inverse(y)
             return x, functools.partial(self._pushed, x)
-        packed, parameters = self._for_kernels()
+        packed, parameters = held
         x = evaluate(_INVERSE, packed, parameters, y)
 
         def push(tangent: Tensor) -> Tensor:
@@ -202,15 +203,20 @@ class LocallyWeightedTranslations(Diffeomorphism):
         """(c, v, ρ²) of all layers."""
         return self.centers, self.directions, torch.exp(2 * self.log_widths).unsqueeze(-1)
 
-    def _for_kernels(self) -> tuple[Array, list[Tensor]]:
-        """The layers as the kernels read them, and the parameters that they are made of."""
+    def _for_kernels(self, points: Tensor) -> tuple[Array, list[Tensor]] | None:
+        """The layers as the kernels read them, and the parameters that they are made of; None where torch is to do it.
+
+        Kernels skip layers that are far from a point. One of NaN is far from none, and would be left out in silence.
+        """
+        if not translations.can_use_kernel(self, points):
+            return None
         parameters: Any = private.held_parameters(self, translations.PARAMETERS)
-        return translations.packed(parameters), parameters
+        packed = translations.packed(parameters)
+        return (packed, parameters) if math.isfinite(packed.sum()) else None
 
     def _evaluated(self, operation: Operation, points: Tensor) -> Tensor:
-        if translations.can_use_kernel(self, points):
-            return evaluate(operation, *self._for_kernels(), points)
-        return operation.by_torch(self._stacked(), points)
+        held = self._for_kernels(points)
+        return operation.by_torch(self._stacked(), points) if held is None else evaluate(operation, *held, points)
 
 
 def _layers_of(centers: Tensor, log_widths: Tensor, strengths: Tensor) -> TorchLayers:

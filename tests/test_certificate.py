@@ -12,7 +12,8 @@ import torch
 
 from baselines import SDSEF
 from latentds import Demonstration, LatentDS, Learned, LocallyWeightedTranslations, StableDS, TubeDS, certify
-from latentds.dynamics import RayDynamics
+from latentds.dynamics import RayDynamics, TubeDynamics
+from latentds.kernels.dispatch import reference
 from latentds.testing import wavy_motion
 from latentds.time_law import PiecewiseLinearLaw
 
@@ -403,6 +404,9 @@ def test_numbers_that_make_no_system_are_not_believed(fitted, name):
 def test_a_region_that_nothing_spans_is_asked_for(fitted):
     ds = fitted("ChebyshevDS", 2)
     ds.start.fill_(math.nan)
+    assert not certify(ds, n_samples=20).holds  # looked at where it was shown
+    ds = TubeDS(2)
+    ds.start.fill_(math.nan)
     with pytest.raises(ValueError, match=r"region: expected .* corners, as the latent ball of \w+ implies none"):
         certify(ds)
     assert not certify(ds, [[-2, -2], [2, 2]], n_samples=20).holds
@@ -483,3 +487,91 @@ def test_bad_input(arguments, message):
 def test_bad_system():
     with pytest.raises(ValueError, match="ds: expected a StableDS, got str"):
         certify("system")
+
+
+class StandsStillOnALine(StableDS):
+    """f = -y |y₀ - c|^p: every motion from beyond the line y₀ = c ends on it, though a rollout steps over it."""
+
+    def __init__(self, dim=2, power=1.0, place=0.3):
+        super().__init__(dim)
+        self.power, self.place = power, place
+
+    def _learn(self, shown, progress):
+        return Learned(0.0)
+
+    def forward(self, y):
+        points, wanted = self._points(y)
+        return (-points * (points[..., :1] - self.place).abs() ** self.power).to(wanted)
+
+    def lyapunov(self, y):
+        points, wanted = self._points(y)
+        return points.square().sum(-1).to(wanted)
+
+
+@pytest.mark.parametrize("place", [0.3, 0.1234567, -0.71])
+@pytest.mark.parametrize("power", [1.0, 2.0])
+def test_a_line_of_equilibria_is_found_though_rollouts_step_over_it(power, place):
+    certificate = certify(StandsStillOnALine(2, power, place), [[-1, -1], [1, 1]])
+    assert "no equilibrium but the attractor" in {line.claim for line in certificate.falsified}
+
+
+class StopsOnTheWay(TubeDynamics):
+    def forward(self, x, y, frame):
+        beside = (self.phase(x, frame) - 0.6).abs().unsqueeze(-1) < 1e-3
+        return torch.where(beside, -1.0, 1.0) * super().forward(x, y, frame)
+
+
+class RunsBack(PiecewiseLinearLaw):
+    def speed(self, s):
+        return torch.where((s > 0.7) & (s < 0.7002), -1.0, 1.0) * super().speed(s)
+
+
+def with_other_dynamics(ds):
+    ds.dynamics = StopsOnTheWay(ds.dynamics.law, ds.dynamics.transverse_law)
+
+
+def with_another_law(ds):
+    ds.dynamics.law = RunsBack(ds.dynamics.law.knots, ds.dynamics.law.speeds)
+
+
+def with_a_hook(ds):
+    ds.dynamics.register_forward_hook(lambda module, inputs, slope: 1.0 * slope)
+
+
+def with_a_method_of_its_own(ds):
+    honest = ds.dynamics.law.speed
+    ds.dynamics.law.speed = lambda s: honest(s)
+
+
+@pytest.mark.parametrize("change", [with_other_dynamics, with_another_law, with_a_hook, with_a_method_of_its_own])
+def test_nothing_is_proven_of_what_is_not_the_code_that_the_proof_is_about(change):
+    ds = TubeDS(2, n_layers=40, refined=False, homotopy="linear").fit(wavy_motion(2))
+    assert "approach the goal" in " ".join(
+        line.claim for line in certify(ds, n_samples=50).lines if line.verdict == "proven"
+    )
+    change(ds)
+    assert not [
+        line for line in certify(ds, n_samples=50).lines if line.verdict == "proven" and "approach" in line.claim
+    ]
+    assert ds.tables() is None or change is with_other_dynamics
+
+
+@pytest.mark.parametrize("name", ["centers", "log_widths", "strengths"])
+def test_a_parameter_that_is_no_number_is_nowhere_left_out(name, tmp_path):
+    shown = wavy_motion(3)
+    ds = TubeDS(3, n_layers=40, refined=False).fit(shown)
+    y = shown.positions[::20].clone().requires_grad_()
+    with torch.no_grad():
+        getattr(ds.diffeomorphism, name)[5] = math.nan
+    for answer in (ds(y), ds.lyapunov(y), ds.rollout(y, torch.tensor([0.0, 1.0]))[:, 1]):
+        assert bool(torch.isnan(answer).all())
+    with reference():
+        assert bool(torch.isnan(ds(y)).all())
+    certificate = certify(ds, n_samples=50)
+    assert [line.claim for line in certificate.falsified] == ["velocities are finite"]
+    assert not [line for line in certificate.lines if line.verdict == "proven"]
+    with pytest.raises(ValueError, match=r"^ds: expected finite parameters"):
+        ds.controller()
+    with pytest.raises(ValueError, match=rf"^ds: expected finite numbers, got NaN or inf in diffeomorphism\.{name}"):
+        ds.save(tmp_path / "never")
+    assert not (tmp_path / "never").exists()

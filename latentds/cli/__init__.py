@@ -130,8 +130,8 @@ def tell_fit(report: FitReport, title: str) -> None:
     if (fit := report.fidelity) is not None:
         more = fit.spread
         for what, value, limit in (
-            ("distance of the motion from the demonstration, in its sizes", fit.miss, fidelity.MISS_LIMIT + more),
-            ("  the worst from starts beside the demonstrated one", fit.nearby, fidelity.NEARBY_LIMIT + more),
+            ("distance of the motion from the demonstration, in its sizes", fit.miss, fidelity.MISS_LIMIT),
+            ("  the worst from starts beside the demonstrated one", fit.nearby, fidelity.NEARBY_LIMIT),
             ("  of their ends when the demonstration ends", fit.end, fidelity.END_LIMIT + more),
             ("largest speed within 10 % of the size, over the largest shown", fit.fastest, fidelity.SPEED_LIMIT),
         ):
@@ -139,7 +139,7 @@ def tell_fit(report: FitReport, title: str) -> None:
         span = f"{fidelity.LEAST_LENGTH_RATIO:g} to {fidelity.LARGEST_LENGTH_RATIO:g}"
         table.add_row("length of the motion over that of the demonstration", f"{fit.length_ratio:.3g}", span)
         if more:
-            table.add_row("distance of the demonstrations from each other", f"{more:.3g}", "")
+            table.add_row("distance of the demonstrations' goals from their mean", f"{more:.3g}", "")
     tell(table)
     for note in report.notes:
         tell(f"note: {note}")

@@ -44,6 +44,8 @@ class Controller:
     def __init__(self, ds: VelocityField, *, max_speed: float = math.inf) -> None:
         self.dim = ds.dim
         self.max_speed = number_in(max_speed, "max_speed", 0, math.inf, ends="(]")
+        if not all(bool(torch.isfinite(tensor).all()) for tensor in ds.state_dict().values()):
+            raise ValueError(f"ds: expected finite parameters, got {type(ds).__name__} with NaN or inf")
         self._attractor = ds.attractor.detach().to("cpu", torch.float64, copy=True).numpy()
         self._placed = np.array([*np.zeros(self.dim), 1.0, self.max_speed])  # shift, speed, limit: as the kernel has it
         tables = ds.tables()
@@ -58,8 +60,9 @@ class Controller:
 
     @property
     def goal(self) -> Array:
-        """Where motions end, (n,): the system's attractor until set. The motion moves with it as a whole."""
+        """Where motions end, (n,), read-only: the attractor until set as a whole. The motion moves with it."""
         goal: Array = self._attractor + self._placed[: self.dim]
+        goal.flags.writeable = False  # an entry that is written would move nothing: set the whole
         return goal
 
     @goal.setter

@@ -58,6 +58,15 @@ def tensors_of(module: nn.Module) -> list[Tensor]:
     return [tensor for part in held for tensor in part.values() if tensor is not None]
 
 
+def is_altered(module: nn.Module) -> bool:
+    """Whether hooks, or methods set on instances, make a module or one in it compute something else than its class."""
+    for part in module.modules():
+        hooks = (part._forward_hooks, part._forward_pre_hooks, part._backward_hooks, part._backward_pre_hooks)
+        if any(hooks) or any(callable(getattr(type(part), name, None)) for name in vars(part)):
+            return True
+    return False
+
+
 def graph_loops() -> tuple[Any, Any]:
     """``scan`` and ``while_loop``, each one node of a graph; not public yet, and imported, for a second, when asked."""
     from torch._higher_order_ops import scan, while_loop
