@@ -150,6 +150,8 @@ def run(
     cells = list(cells)
     protocol = RolloutProtocol() if protocol is None else protocol
     _only_once("cells", [cell.name for cell in cells])
+    if store is not None:
+        _check_storable(cells)
     if n_jobs is not None and (isinstance(n_jobs, bool) or not isinstance(n_jobs, int) or n_jobs == 0):
         raise ValueError(f"n_jobs: expected a whole number other than 0, or None, got {n_jobs!r}")
     return _run(cells, protocol, n_jobs, progress, store)
@@ -277,6 +279,18 @@ def _try_out(cells: Sequence[Cell]) -> None:
         except Exception as error:
             got = f"{type(error).__name__}: {error}"
             raise ValueError(f"methods: expected {cell.method!r} to make a StableDS, got {got}") from error
+
+
+def _check_storable(cells: Sequence[Cell]) -> None:
+    """That a store can hold their names and seeds."""
+    for cell in cells:
+        if not cell.seed < 2**63:
+            raise ValueError(f"seeds: expected whole numbers below 2**63 for a store, got {cell.seed}")
+        for text in (cell.method, cell.demonstration, *(judge.name for judge in cell.judges)):
+            try:
+                text.encode()
+            except UnicodeEncodeError:
+                raise ValueError(f"store: expected names that UTF-8 can write, got {text!r}; pass name=") from None
 
 
 def _warn_of_failures(rows: pd.DataFrame) -> None:

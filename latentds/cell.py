@@ -36,6 +36,9 @@ CONVERGED_WITHIN = 1e-2
 ON_GOAL = 1e-6
 """``converged``: largest distance of the attractor from the demonstrated goal, as a share of the motion's size."""
 
+FAILURES = (Exception, SystemExit, GeneratorExit)
+"""What a method may raise without ending the comparison; Ctrl-C ends it."""
+
 SCORES = (
     "dtw", "dtw_fast", "dtw_per_point", "dtw_fast_per_point", "frechet", "endpoint_error", "path_length_ratio",
     "velocity_rmse", "velocity_cosine", "mse", "n_parameters", "n_layers", "fit_seconds", "rollout_seconds",
@@ -197,7 +200,7 @@ def evaluate(cell: Cell, protocol: RolloutProtocol) -> Outcome:
                 warnings.simplefilter("ignore", FitWarning)  # the rows say it
                 ds.fit(cell.shown[0] if len(cell.shown) == 1 else list(cell.shown))
             seconds = time.perf_counter() - began
-    except Exception as raised:
+    except FAILURES as raised:
         return _outcome(cell, protocol, error=raised)
     return judge(ds, cell, protocol, fit_seconds=seconds)
 
@@ -221,7 +224,7 @@ def judge(ds: StableDS, cell: Cell, protocol: RolloutProtocol, *, fit_seconds: f
     try:
         with reproducible_torch(cell.seed):
             of_judge = [_velocity_scores(ds, one) for one in judges]
-            measured = dict(cell.measure(ds, cell)) if cell.measure else {}
+            measured = {k: _plain(k, v) for k, v in cell.measure(ds, cell).items()} if cell.measure else {}
             if taken := measured.keys() & {*COLUMNS, "judge"}:
                 raise ValueError(f"measure: expected names that rows do not have, got {sorted(taken)}")
             facts |= _facts(ds) | measured
@@ -236,7 +239,7 @@ def judge(ds: StableDS, cell: Cell, protocol: RolloutProtocol, *, fit_seconds: f
             if path.shape != wanted:
                 raise ValueError(f"rollout: expected shape {wanted}, got {tuple(path.shape)}")
         paths = np.array([path.numpy() for path in moved], dtype=np.float64)
-    except Exception as raised:
+    except FAILURES as raised:
         return _outcome(cell, protocol, facts, of_judge, error=raised)
     return _outcome(cell, protocol, facts, of_judge, follows, converged, paths)
 
@@ -249,13 +252,13 @@ def _outcome(
     follows: bool = False,
     converged: NDArray[np.bool_] | None = None,
     paths: Array | None = None,
-    error: Exception | None = None,
+    error: BaseException | None = None,
 ) -> Outcome:
     """The rows of a cell; NaN stands for what is missing because of an error."""
     share = protocol.n_starts + 1
     if paths is None:
         paths = np.full((len(cell.judges), share, protocol.n_points, cell.shown[0].dim), np.nan)
-    reason = "" if error is None else f"{type(error).__name__}: {error}"
+    reason = "" if error is None else _reason(error)
     rows = [
         {"method": cell.method, "demonstration": cell.demonstration, "seed": cell.seed, "start": share * i + k}
         | {
@@ -273,6 +276,23 @@ def _outcome(
         for k, path in enumerate(paths[i])
     ]
     return Outcome(*cell.name, tuple(rows), paths.reshape(-1, *paths.shape[2:]))
+
+
+def _reason(error: BaseException) -> str:
+    try:
+        text = str(error)
+    except Exception:
+        text = "an error that cannot say what it is"
+    return f"{type(error).__name__}: {text}".encode("utf-8", "backslashreplace").decode()
+
+
+def _plain(name: Any, value: Any) -> bool | int | float | str | None:
+    """A measured value as Python's own, of NumPy's or torch's scalars: rows are kept as JSON."""
+    if isinstance(value, np.generic) or (isinstance(value, (Tensor, np.ndarray)) and value.ndim == 0):
+        value = value.item()
+    if not (isinstance(name, str) and (value is None or isinstance(value, (bool, int, float, str)))):
+        raise TypeError(f"measure: expected names with numbers or strings, got {name!r}: {type(value).__name__}")
+    return value
 
 
 def build(cell: Cell) -> StableDS:

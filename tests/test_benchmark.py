@@ -2,12 +2,14 @@
 
 import ctypes
 import math
+import os
 import signal
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 
 import joblib
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from scipy import stats
@@ -486,3 +488,91 @@ def test_who_hears_ctrl_c_otherwise_still_does():
     with ThreadPoolExecutor(1) as pool:  # where no handler can be set
         (outcome,) = pool.submit(lambda: list(run([Cell("m", Straight, SPIRAL)], n_jobs=1))).result()
     assert outcome.rows[0]["status"] == "ok"
+
+
+class Exits(Straight):
+    def _learn(self, shown, progress):
+        raise SystemExit("no licence")
+
+
+class Generates(Straight):
+    def _learn(self, shown, progress):
+        raise GeneratorExit("over")
+
+
+class CannotSay(Straight):
+    def _learn(self, shown, progress):
+        class Mute(Exception):
+            def __str__(self):
+                raise RuntimeError("no text")
+
+        raise Mute
+
+
+class SaysWhatNoFileHolds(Straight):
+    def _learn(self, shown, progress):
+        raise OSError(os.fsdecode(b"caf\xe9"))
+
+
+class ReportsFloat32(Straight):
+    def _learn(self, shown, progress):
+        super()._learn(shown, progress)
+        return Learned(np.float32(0.5), np.int64(3))
+
+
+class HoldsBfloat16(Straight):
+    def __init__(self, dim):
+        super().__init__(dim)
+        self.register_buffer("table", torch.zeros(3, dtype=torch.bfloat16))
+
+
+class HoldsASparseTensor(Straight):
+    def __init__(self, dim):
+        super().__init__(dim)
+        self.graph = torch.eye(3).to_sparse()
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("stored", [False, True])
+@pytest.mark.parametrize(
+    ("method", "status"),
+    [(bad, "failed") for bad in (Exits, Generates, CannotSay, SaysWhatNoFileHolds)]
+    + [(odd, "ok") for odd in (ReportsFloat32, HoldsBfloat16, HoldsASparseTensor)],
+)
+def test_one_bad_method_does_not_end_a_comparison(method, status, stored, tmp_path):
+    store = {"store": tmp_path / "cells.sqlite"} if stored else {}
+    rows = compare({"bad": method, "good": Straight}, SPIRAL, **QUICK, **store)
+    assert rows.groupby("method")["status"].unique().map(list).to_dict() == {"bad": [status], "good": ["ok"]}
+    again = compare({"bad": method, "good": Straight}, SPIRAL, **QUICK, **store)
+    if stored and status == "ok":
+        pd.testing.assert_frame_equal(rows, again)
+
+
+@pytest.mark.parametrize(
+    "value", [np.float32(1), np.int64(2), np.bool_(True), torch.tensor(0.5), np.array(3.0), "x", None]
+)
+def test_what_is_measured_is_kept_as_pythons_own(value, tmp_path):
+    cell = Cell("m", Straight, SPIRAL, measure=lambda ds, cell: {"extra": value})
+    store = tmp_path / "cells.sqlite"
+    first, again = (
+        [outcome.rows[0]["extra"] for outcome in run([cell], RolloutProtocol(0, 0.1, 20), n_jobs=1, store=store)]
+        for _ in range(2)
+    )
+    assert first == again
+    assert type(first[0]) in (bool, int, float, str, type(None))
+
+
+def test_what_is_no_number_fails_its_cell():
+    cell = Cell("m", Straight, SPIRAL, measure=lambda ds, cell: {"extra": [1, 2]})
+    (outcome,) = run([cell], RolloutProtocol(0, 0.1, 20), n_jobs=1)
+    assert outcome.rows[0]["error"] == "TypeError: measure: expected names with numbers or strings, got 'extra': list"
+
+
+def test_what_a_store_cannot_hold_is_refused_before_any_work(tmp_path):
+    store = tmp_path / "cells.sqlite"
+    with pytest.raises(ValueError, match=r"^seeds: expected whole numbers below 2\*\*63 for a store, got 9"):
+        run([Cell("m", Straight, SPIRAL, seed=2**63)], n_jobs=1, store=store)
+    named = Demonstration(SPIRAL.positions, SPIRAL.dt, os.fsdecode(b"caf\xe9"))
+    with pytest.raises(ValueError, match=r"^store: expected names that UTF-8 can write, got 'caf\\udce9'; pass name="):
+        run([Cell("m", Straight, named)], n_jobs=1, store=store)
+    assert not store.exists()
