@@ -268,6 +268,6 @@ def _measure(
         "timing": _timing_gap(motions[0], duration, path, pace * one.duration) / size,
         "rise": float(largest_rise(energy)),
         "restart_gap": float(restart_gap(ds, moved[0], times)) / size,
-        "flow_gap": float(flow_gap(ds, starts[:3], times).max()) / size,
+        "flow_gap": float(flow_gap(ds, starts[:3], times, FLOW_GAP_LIMIT / 2 * size).max()) / size,
         "latent_error": 0.0 if error is None else float(error.max()),
     }
