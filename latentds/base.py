@@ -629,6 +629,8 @@ class MovedDS(StableDS):
         return replace(report, learned_from=tuple(one.fingerprint for one in shown))
 
     def excerpts(self) -> tuple[Excerpt, ...]:
+        if not (float(self.similarity.speed) > 0 and float(self.similarity.scale) > 0):
+            return ()  # written in place by a hand: no motion of it lasts as long as anything that was shown
         return tuple(
             self.similarity.carry_excerpt(one, self.ds.attractor, self.attractor) for one in self.ds.excerpts()
         )

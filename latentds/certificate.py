@@ -150,8 +150,6 @@ class _Search:
 
     def lines(self) -> list[Line]:
         lines, inside = [self._finite()], self.ds
-        if lines[0].verdict == "falsified":
-            return lines
         while isinstance(inside, MovedDS):
             inside = inside.ds
         if isinstance(inside, LatentDS):
@@ -159,6 +157,8 @@ class _Search:
         if isinstance(self.ds, LatentDS):
             lines += [self._rate(self.ds)]
         lines += [self._attractor()]
+        if lines[0].verdict == "falsified":
+            return lines
         with torch.no_grad():
             self.paths = self.ds.rollout(self.starts, self.times)
         if isinstance(self.ds, LatentDS):

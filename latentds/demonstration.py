@@ -20,6 +20,8 @@ from .curves import extent, interpolated
 
 logger = logging.getLogger(__name__)
 
+SMALLEST, LARGEST = 1e-40, 1e40
+"""Sizes that a fit takes: squares and cubes of numbers so small or large are still numbers."""
 CLOSED = 1e-6
 """Distance of the goal from the start, in sizes of the motion, up to which it counts as a closed loop."""
 
@@ -233,6 +235,10 @@ def demonstrations_of(demonstration: Any, dim: int) -> list[Demonstration]:
     for item in shown:
         if item.dim != dim:
             raise ValueError(f"demonstration: expected dimension {dim}, got {item.dim} ({item!r})")
+        if not SMALLEST <= item.size <= LARGEST:
+            raise ValueError(
+                f"demonstration: expected a size of {SMALLEST:g} to {LARGEST:g}, got {item.size:g}; use another unit"
+            )
     named = list({item.columns: None for item in shown if item.columns})
     if len(named) > 1:
         raise ValueError(f"demonstration: expected the same columns in all, got {named[0]} and {named[1]}")

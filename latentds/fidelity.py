@@ -32,7 +32,7 @@ that brings back what is so far off in a twentieth of the duration is a few time
 ROUNDING_LIMIT = 1e-3
 """What rounding may do along a motion: let V rise by so much of itself, carry it so many sizes away when it is begun
 anew half-way, bring encode(decode(x)) so many latent lengths off x. Sound systems stay orders of magnitude below."""
-FLOW_GAP_LIMIT = 0.02
+FLOW_GAP_LIMIT = 0.05
 """Distance of a rollout from the integral of the velocity field, in sizes; sound fits stay below
 a third of it."""
 

@@ -79,12 +79,19 @@ def _made(header: dict[str, Any], known: dict[str, type[StableDS]], held: int) -
     if not isinstance(settings, dict) or set(settings) != set(wanted):
         raise ValueError(f"expected the settings {sorted(wanted)}, got {settings!r:.200}")
     sizes = [v for k, v in settings.items() if (k == "dim" or k.startswith("n_")) and isinstance(v, int)]
-    if math.prod(max(size, 1) for size in sizes) > SLACK * max(held, 1):
+    room = _dim_inside(header) ** 2 > held if header["class"] == "MovedDS" else False  # its rotation's numbers
+    if room or math.prod(max(size, 1) for size in sizes) > SLACK * max(held, 1):
         raise ValueError(f"expected sizes that {held} stored numbers can fill, got {settings!r:.200}")
     settings = {
         name: _made(value, known, held) if isinstance(value, dict) else value for name, value in settings.items()
     }
     return known[header["class"]](**settings)
+
+
+def _dim_inside(header: dict[str, Any]) -> int:
+    """n of the system that a moved one holds."""
+    settings = header["settings"]
+    return int(settings["dim"]) if "dim" in settings else _dim_inside(settings["ds"])
 
 
 def _typed(value: Any, wanted: Any, name: str) -> Any:

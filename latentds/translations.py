@@ -175,6 +175,7 @@ class LocallyWeightedTranslations(Diffeomorphism):
     def invertibility(self) -> Invertibility:
         bound = self.widths * torch.linalg.vector_norm(self.directions, dim=-1) / WIDTH_BOUND
         margins = torch.nan_to_num(torch.minimum(self.margins, 1 - bound + 1e-12), nan=-math.inf)
+        margins = torch.where(torch.isfinite(self.centers).all(-1), margins, -math.inf)
         worst = int(margins.argmin())
         fold = None if margins[worst] > 0 else self._fold(worst)
         claim, detail = "every layer is invertible, ρ‖v‖√(2/e) < 1", "smallest margin"

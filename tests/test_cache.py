@@ -442,7 +442,7 @@ def test_a_file_of_another_kind_is_refused(file):
 TYPED = """
 import sys
 import torch
-from latentds import StableDS, compare, datasets
+from latentds import compare, datasets, Learned, StableDS
 
 RATE = {rate}
 

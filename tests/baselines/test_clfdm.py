@@ -67,13 +67,13 @@ def test_the_correction_is_the_least_that_does():
     wish = ds.regression(z)
     speed = wish.norm(dim=-1, keepdim=True)
     wish = wish * (1 + (speed / (2 * ds.pace)) ** 8) ** -0.125
-    change = ds._velocity(z) - wish
+    change = ds.normalized_velocity(z) - wish
     descends = (slope * wish).sum(-1) <= -DESCENT_RATE * energy
     assert 0.1 < float(descends.double().mean()) < 0.9
     assert float(change[descends].abs().max()) < 1e-12
     along = (change * slope).sum(-1) / slope.norm(dim=-1)
     torch.testing.assert_close(along[~descends].abs(), change[~descends].norm(dim=-1))
-    corrected = (slope * ds._velocity(z)).sum(-1)[~descends]
+    corrected = (slope * ds.normalized_velocity(z)).sum(-1)[~descends]
     torch.testing.assert_close(corrected, -DESCENT_RATE * energy[~descends])
 
 
