@@ -250,7 +250,7 @@ def _sources(names: Iterable[str]) -> list[Any]:
             continue
         installed = not {"site-packages", "dist-packages"}.isdisjoint(Path(spec.origin).parts)
         if top in _NAMED or (installed and top not in own):
-            versions.update(f"{name} {importlib.metadata.version(name)}" for name in _distributions().get(top, ()))
+            versions.update(f"{name} {_version(name)}" for name in _distributions().get(top, ()))
             continue
         source = Path(spec.origin).read_bytes()
         imports, constants = _read(source, spec.parent or "") if spec.origin.endswith(".py") else ([], {})
@@ -268,6 +268,7 @@ def _sources(names: Iterable[str]) -> list[Any]:
 
 
 _distributions = cache(importlib.metadata.packages_distributions)
+_version = cache(importlib.metadata.version)  # which reads and parses a file
 
 
 def _spec(name: str) -> ModuleSpec | None:
