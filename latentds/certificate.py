@@ -324,12 +324,13 @@ class _Search:
             energy = self.ds.lyapunov(self.paths)
             rise = energy.diff(dim=-1) / energy[:, :1]
             apart = restart_gap(self.ds, self.paths, self.times) / self.size
-            off = flow_gap(self.ds, self.starts, self.times, FLOW_GAP_LIMIT / 2 * self.size) / self.size
+            few = self.starts[: len(self.shown) + NEARBY_STARTS]
+            off = flow_gap(self.ds, few, self.times, FLOW_GAP_LIMIT / 2 * self.size) / self.size
         before = self.paths[:, :-1].flatten(0, 1)
         return [
             self._judge("V falls along motions", rise.flatten(), self.tolerance, "largest rise over V(0)", before),
             self._judge("a motion is its two halves", apart, self.rounding, "largest distance", self.starts),
-            self._judge("motions are the field's integral", off, FLOW_GAP_LIMIT, "largest distance", self.starts),
+            self._judge("motions are the field's integral", off, FLOW_GAP_LIMIT, "largest distance", few),
         ]
 
     def _descent(self) -> Line:

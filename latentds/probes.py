@@ -14,6 +14,9 @@ from torch import Tensor
 
 from .arguments import Array
 
+MOST_POINTS = 16_000
+"""Of a motion along which the velocity field is integrated."""
+
 
 class Moving(Protocol):
     """A velocity field with its motions: any :class:`~latentds.StableDS`."""
@@ -59,23 +62,26 @@ def restart_gap(ds: Moving, motions: Tensor, times: Tensor) -> Tensor:
 def flow_gap(ds: Moving, y0: Tensor, times: Tensor, enough: float) -> Tensor:
     """How far motions are from the integral of the velocity field along them: (..., n), (T,) evenly spaced -> (...).
 
-    0 for the field's own flow but for Simpson's rule, at 4, 16, then 64 points a step until all are below ``enough``: a
-    map with narrow layers makes velocities that change within a step. Nothing is solved, so that stiff fields cost no
-    more.
+    0 for the field's own flow but for Simpson's rule, at 4, 16, then 64 points a step until all are below ``enough`` or
+    finer points no longer help: a map with narrow layers makes velocities that change within a step. Nothing is solved,
+    so that stiff fields cost no more.
     """
     before = None
     for finer in (4, 16, 64):
+        if before is not None and finer * len(times) > MOST_POINTS:
+            break
         clock = torch.linspace(0, float(times[-1] - times[0]), finer * (len(times) - 1) + 1, dtype=times.dtype)
         motions = ds.rollout(y0, clock.to(times))
         passed = cumulative_simpson(ds(motions).double().cpu().numpy(), x=clock.numpy(), axis=-2, initial=0)
         missed = motions - motions[..., :1, :] - torch.from_numpy(passed).to(motions)
         gaps: Tensor = torch.linalg.vector_norm(missed, dim=-1).amax(-1)
         # What the rule misses at a kink is at most a quarter of what it missed at a quarter of the points.
-        left = gaps if before is None else ((4 * gaps - before) / 3).clamp(min=0)
-        if bool((torch.minimum(left, gaps) <= enough).all()):
-            break
+        left = gaps if before is None else torch.minimum(gaps, (4 * gaps - before) / 3).clamp(min=0)
+        settled = left <= enough if before is None else (left <= enough) | (gaps > before / 2)
         before = gaps
-    return torch.minimum(left, gaps)
+        if bool(settled.all()):
+            break
+    return left
 
 
 def round_trip_gap(ds: Latent, y: Tensor) -> Tensor:
