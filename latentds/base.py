@@ -41,6 +41,7 @@ FORMAT = 4
 """Of the files of systems; raised when they change so that another latentds would misread them."""
 
 Self = TypeVar("Self", bound="StableDS")
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -618,15 +619,21 @@ class MovedDS(StableDS):
         return self.ds.report_type
 
     def _learn(self, shown: Sequence[Demonstration], progress: bool) -> Learned:
-        return self.ds._learn(shown, progress)
+        return self._teach(self.ds._learn, shown, progress)
 
     def _learn_and_measure(self, shown: Sequence[Demonstration], progress: bool) -> FitReport:
+        report = self._teach(self.ds._learn_and_measure, shown, progress)
+        return replace(report, learned_from=tuple(one.fingerprint for one in shown))
+
+    def _teach(
+        self, learn: Callable[[Sequence[Demonstration], bool], T], shown: Sequence[Demonstration], progress: bool
+    ) -> T:
+        """Let the system inside learn what becomes the demonstrations, and end where it then ends."""
         before, after = self.ds.attractor.clone(), self.attractor
-        theirs = [self.similarity.fetch_motion(one, before, after) for one in shown]
-        report = self.ds._learn_and_measure(theirs, progress)
+        result = learn([self.similarity.fetch_motion(one, before, after) for one in shown], progress)
         with torch.no_grad():
             after.copy_(self.similarity.carry(self.ds.attractor, before, after))
-        return replace(report, learned_from=tuple(one.fingerprint for one in shown))
+        return result
 
     def excerpts(self) -> tuple[Excerpt, ...]:
         if not (float(self.similarity.speed) > 0 and float(self.similarity.scale) > 0):

@@ -15,7 +15,7 @@ from .arguments import Array, number_in, point_array, positive
 from .curves import extent, interpolated, jitter
 from .demonstration import Demonstration
 from .metrics import dtw, endpoint_error, path_length, path_length_ratio
-from .probes import flow_gap, largest_rise, restart_gap, unit_ball
+from .probes import flow_gap, restart_gap, unit_ball
 
 MISS_LIMIT = 0.05
 """Largest mean distance from the demonstration, in its sizes; good fits stay below half of it, even of 1 % noise."""
@@ -33,9 +33,7 @@ ROUNDING_LIMIT = 1e-3
 """What rounding may do along a motion: let V rise by so much of itself, carry it so many sizes away when it is begun
 anew half-way, bring encode(decode(x)) so many latent lengths off x. Sound systems stay orders of magnitude below."""
 FLOW_GAP_LIMIT = 0.05
-"""Distance of a rollout from the integral of the velocity field, in sizes; sound fits stay below
-a third of it."""
-
+"""Distance of a rollout from the integral of the velocity field, in sizes; sound fits stay below a third."""
 TIMING_LIMIT = 0.05
 """Mean distance from the demonstration at equal times, in sizes: neither DTW nor a length sees too fast a motion."""
 
@@ -266,7 +264,7 @@ def _measure(
         "nearby": float(np.max(missed[1:], initial=0.0)),
         "fastest": float(torch.linalg.vector_norm(velocity, dim=-1).max()) / one.fastest,
         "timing": _timing_gap(motions[0], duration, path, pace * one.duration) / size,
-        "rise": float(largest_rise(energy)),
+        "rise": float(energy.diff().max() / energy[0]),
         "restart_gap": float(restart_gap(ds, moved[0], times)) / size,
         "flow_gap": float(flow_gap(ds, starts[:3], times, FLOW_GAP_LIMIT / 2 * size).max()) / size,
         "latent_error": 0.0 if error is None else float(error.max()),

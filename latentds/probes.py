@@ -35,19 +35,12 @@ class Latent(Protocol):
 
     def decode(self, x: Tensor) -> Tensor: ...
 
-    def jacobian(self, x: Tensor) -> Tensor: ...
-
 
 def unit_ball(count: int, dim: int, draw: np.random.Generator) -> Array:
     """Points evenly distributed in the unit ball of R^n: (count, n)."""
     # The first n coordinates of a uniform point on the sphere of R^(n+2) are uniform in the ball of R^n.
     normal = draw.standard_normal((count, dim + 2))
     return np.asarray((normal / np.linalg.norm(normal, axis=1, keepdims=True))[:, :dim])
-
-
-def largest_rise(energy: Tensor) -> Tensor:
-    """Of V along motions, over V at their start: (..., T) -> (...)."""
-    return energy.diff(dim=-1).amax(-1) / energy[..., 0]
 
 
 def restart_gap(ds: Moving, motions: Tensor, times: Tensor) -> Tensor:
@@ -87,16 +80,4 @@ def flow_gap(ds: Moving, y0: Tensor, times: Tensor, enough: float) -> Tensor:
 def round_trip_gap(ds: Latent, y: Tensor) -> Tensor:
     """‖decode(encode(y)) - y‖: (..., n) -> (...)."""
     gaps: Tensor = torch.linalg.vector_norm(ds.decode(ds.encode(y)) - y, dim=-1)
-    return gaps
-
-
-def jacobian_gap(ds: Latent, x: Tensor) -> Tensor:
-    """‖J - J'‖/‖J'‖, J the closed-form Jacobian and J' autograd's, in the Frobenius norm: (B, n) -> (B,)."""
-    x = x.detach().requires_grad_()
-    with torch.enable_grad():
-        rows = [torch.autograd.grad(column.sum(), x, retain_graph=True)[0] for column in ds.decode(x).unbind(-1)]
-    wanted = torch.stack(rows, dim=-2)
-    with torch.no_grad():
-        closed = ds.jacobian(x)
-    gaps: Tensor = torch.linalg.matrix_norm(closed - wanted) / torch.linalg.matrix_norm(wanted)
     return gaps

@@ -13,7 +13,7 @@ import torch
 
 import latentds
 from baselines import FDM, SDSEF
-from latentds import Demonstration, TubeDS, certify
+from latentds import ChebyshevDS, Demonstration, TubeDS, certify
 from latentds.base import MovedDS
 from latentds.fidelity import Excerpt
 from latentds.testing import parametrize_stable_ds, wavy_motion
@@ -269,3 +269,12 @@ def test_a_rotation_typed_in_is_made_one():
     moved = MovedDS(FDM(2)).transformed(rotation=[[0.8660254, -0.5], [0.5, 0.8660254]])
     rotation = moved.similarity.rotation
     torch.testing.assert_close(rotation.T @ rotation, torch.eye(2, dtype=F64), rtol=0, atol=1e-15)
+
+
+def test_a_moved_system_learns_where_it_is_also_for_one_that_holds_it():
+    shown = wavy_motion(2)
+    moved = ChebyshevDS(2, n_layers=20).with_goal([3.0, -2.0]).slowed(2.0)
+    moved._learn([shown], False)  # as a method does that lets another one learn
+    torch.testing.assert_close(moved.attractor, shown.goal)
+    twin = ChebyshevDS(2, n_layers=20).with_goal([3.0, -2.0]).slowed(2.0).fit(shown)
+    assert torch.equal(moved(shown.positions), twin(shown.positions))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -221,14 +222,15 @@ class Search:
     contraction: float | None
     plan: Plan
 
-    def path(self) -> tuple[Array, PiecewiseLinearLaw]:
+    @cached_property
+    def path_and_law(self) -> tuple[Array, PiecewiseLinearLaw]:
         """(N, n) even in arc length, and the demonstrated time law."""
         points, way, times = arc_length_path(self.shape.positions.numpy(), self.shape.times.numpy(), self.plan.n_points)
         return points, PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
 
     @torch.no_grad()
     def run(self) -> Match:
-        path, law = self.path()
+        path, law = self.path_and_law
         best = self._best_of_few(path, law)
         notes: tuple[str, ...] = ()
         if self.n_layers is None:

@@ -116,7 +116,7 @@ class TubeDS(LatentDS):
 
         several = Several((strands - origin) / unit, arrivals) if len(shown) > 1 else None
         search = Search(shape, several, try_out, self.n_layers, self.homotopy, self.refined, self.contraction, PLAN)
-        path = search.path()[0]
+        path = search.path_and_law[0]
         refuse_crossings(path, origin, unit)
         goal_apart(motion, motion.goal)
         match = search.run()
