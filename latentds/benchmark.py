@@ -62,8 +62,9 @@ def compare(
         progress: show a bar with method, demonstration and time left.
         store: a file that keeps every finished cell (:class:`latentds.cache.CellStore`), so that a run that was
             interrupted goes on where it stopped. A cell is known by its label, the method's settings and code, the
-            demonstrations and judges, the seed and the protocol: if one changes, it is computed anew. What of the code
-            is seen, and what not, is said at :func:`latentds.cache.fingerprint`. Failed cells are not kept, nor are
+            demonstrations and judges, the seed and the protocol: if one changes, it is computed anew. Not seen is a
+            change of a data file that the method reads, or of a module that it imports under a computed name: delete
+            the file of cells then (:func:`latentds.cache.fingerprint` says more). Failed cells are not kept, nor are
             those of a method whose code or settings cannot be read; a warning names it.
         paths: a mapping to put the rollouts into, {(method, demonstration, seed): (starts, n_points, n)}, for pictures
             and for :func:`latentds.report.write`.

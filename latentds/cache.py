@@ -7,6 +7,7 @@ import functools
 import hashlib
 import importlib.metadata
 import importlib.util
+import inspect
 import io
 import json
 import os
@@ -14,13 +15,13 @@ import pickle
 import platform
 import sqlite3
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import cache
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import CellType, CodeType, FunctionType, GetSetDescriptorType, MemberDescriptorType, ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -123,11 +124,12 @@ def fingerprint(*things: Any) -> str:
     Objects count with what a pickle of them would hold, functions with their bytecode, defaults and closure, classes
     with their attributes and bases. The files that define these count, and what they import, directly or not, as far
     as it is in their own package, in this one, or not installed; other packages count with their version. A function
-    from a script, a notebook or stdin counts with the globals that it names. Constants of a counted file that have
-    another value now count, too.
+    from a script, a notebook or stdin counts with the globals that it names. What a counted file defines or imports
+    and what is another thing in memory now counts, too: constants that were set, functions and methods that were
+    replaced, and code that is older than its file, as after an edit.
 
-    Not seen are data files, modules that are imported under a computed name, functions that were replaced in a module
-    at run time, and whether a file was edited between its import and now.
+    Not seen are data files, modules that are imported under a computed name, and globals that are neither a constant
+    that is written out nor a function, class or import.
 
     Raises:
         UnreadableError: for what a pickle cannot hold, such as a lock, a generator, or a compiled function without a
@@ -234,7 +236,7 @@ class _KeyPickler(pickle._Pickler):
 
 def _names(code: CodeType) -> set[str]:
     """What a function, and those nested in it, may look up in their module."""
-    return set(code.co_names).union(*(_names(part) for part in code.co_consts if isinstance(part, CodeType)))
+    return set(code.co_names).union(*map(_names, _inner(code)))
 
 
 def _sources(names: Iterable[str]) -> list[Any]:
@@ -253,17 +255,12 @@ def _sources(names: Iterable[str]) -> list[Any]:
             versions.update(f"{name} {_version(name)}" for name in _distributions().get(top, ()))
             continue
         source = Path(spec.origin).read_bytes()
-        imports, constants = _read(source, spec.parent or "") if spec.origin.endswith(".py") else ([], {})
-        live = getattr(sys.modules.get(name), "__dict__", {})
-        modules[name] = (
-            source,
-            [
-                (key, live[key])
-                for key, value in constants.items()
-                if key in live and (type(live[key]), live[key]) != (type(value), value)
-            ],
-        )
-        todo += [inner if _spec(inner := f"{base}.{part}") else base for base, part in imports]
+        if not spec.origin.endswith(".py"):
+            modules[name] = (source, [])
+            continue
+        text = _read(source, spec.parent or "")
+        modules[name] = (source, text.altered(getattr(sys.modules.get(name), "__dict__", {})))
+        todo += [inner if _spec(inner := f"{base}.{part}") else base for base, part in text.imports]
     return [sorted(modules.items()), sorted(versions)]
 
 
@@ -282,25 +279,105 @@ def _spec(name: str) -> ModuleSpec | None:
     return PathFinder.find_spec(name, folders) if folders else None
 
 
+class _Text(NamedTuple):
+    """What a file says, to be held against what is in memory.
+
+    Attributes:
+        imports: (module, name in it), at any depth.
+        bound: those at the top level, by the name that they get.
+        constants: those at the top level that are written out.
+        functions: the codes of each function at the top level, by its name, and in a class, by "class.name".
+        plain: those of them that no decorator can make something else of.
+    """
+
+    imports: list[tuple[str, str]]
+    bound: dict[str, list[tuple[str, str]]]
+    constants: dict[str, Any]
+    functions: dict[str, list[CodeType]]
+    plain: set[str]
+
+    def altered(self, live: Mapping[str, Any]) -> list[tuple[str, Any]]:
+        """Names and values of a module in memory that are not what the file says."""
+        found = {
+            name: live[name]
+            for name, value in self.constants.items()
+            if name in live and (type(live[name]), live[name]) != (type(value), value)
+        }
+        for name, sources in self.bound.items():
+            meant = [thing for base, part in sources for thing in _imported(base, part)]
+            if name in live and meant and not any(live[name] is thing for thing in meant):
+                found[name] = live[name]
+        for name, versions in self.functions.items():
+            owner, _, own = name.rpartition(".")
+            holder = vars(live[owner]) if isinstance(live.get(owner), type) else {} if owner else live
+            if own in holder and not _is_of(holder[own], versions, decorated=name not in self.plain):
+                found[name] = holder[own]
+        return sorted(found.items())
+
+
+def _imported(base: str, part: str) -> list[Any]:
+    """What ``from base import part`` may give, as far as it is imported already."""
+    package, module = sys.modules.get(base), sys.modules.get(f"{base}.{part}" if part else base)
+    return [*([vars(package)[part]] if package and part in vars(package) else []), *([module] if module else [])]
+
+
+def _is_of(value: Any, versions: list[CodeType], *, decorated: bool) -> bool:
+    """Whether a value is the function that a file defines; what a decorator makes of it beyond telling is not asked."""
+    codes = _codes(inspect.unwrap(value) if decorated and callable(value) else value)
+    return all(code in versions for code in codes) and (decorated or bool(codes))
+
+
+def _codes(value: Any) -> list[CodeType]:
+    """Of the functions that are behind a value."""
+    if isinstance(value, FunctionType):
+        return [value.__code__]
+    if isinstance(value, property):
+        return [code for part in (value.fget, value.fset, value.fdel) for code in _codes(part)]
+    if isinstance(value, (staticmethod, classmethod)):
+        return _codes(inspect.unwrap(value.__func__))
+    if isinstance(value, functools._lru_cache_wrapper):
+        return _codes(value.__wrapped__)
+    if isinstance(value, (functools.cached_property, functools.partial)):
+        return _codes(value.func)
+    return _codes(value.py_func) if hasattr(type(value), "py_func") or is_jitted(value) else []
+
+
 @cache
-def _read(source: bytes, package: str) -> tuple[list[tuple[str, str]], dict[str, Any]]:
-    """What a file imports, as (module, name in it), and the constants at its top level that are written out."""
-    imports: list[tuple[str, str]] = []
-    constants: dict[str, Any] = {}
-    changing: set[str] = set()
+def _read(source: bytes, package: str) -> _Text:
     tree = ast.parse(source)
-    for node in ast.walk(tree):
+    text = _Text([], {}, {}, {}, set())
+    changing: set[str] = set()
+
+    def imported(node: ast.AST) -> list[tuple[str, tuple[str, str]]]:
         if isinstance(node, ast.Import):
-            imports += [(alias.name, "") for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
+            return [(alias.asname or "", (alias.name, "")) for alias in node.names]
+        if isinstance(node, ast.ImportFrom):
             base = importlib.util.resolve_name("." * node.level + (node.module or ""), package)
-            imports += [(base, alias.name) for alias in node.names]
-        elif isinstance(node, ast.Global):
-            changing.update(node.names)
+            return [(alias.asname or alias.name, (base, alias.name)) for alias in node.names]
+        return []
+
+    for node in ast.walk(tree):
+        text.imports.extend(source for _, source in imported(node))
+        changing.update(node.names if isinstance(node, ast.Global) else ())
     for node in tree.body:
+        for name, meant in imported(node):
+            text.bound.setdefault(name, []).append(meant)
         target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
         if isinstance(node, (ast.Assign, ast.AnnAssign)) and isinstance(target, ast.Name) and node.value:
             with suppress(ValueError, TypeError):
-                constants[target.id] = ast.literal_eval(node.value)
-    # What begins empty is there to be filled.
-    return imports, {name: value for name, value in constants.items() if value and name not in changing}
+                text.constants[target.id] = ast.literal_eval(node.value)
+        inner = [(f"{node.name}.", part) for part in node.body] if isinstance(node, ast.ClassDef) else [("", node)]
+        for owner, part in inner:
+            if isinstance(part, ast.FunctionDef) and not part.decorator_list:
+                text.plain.add(owner + part.name)
+    for name in [name for name, value in text.constants.items() if not value or name in changing]:
+        del text.constants[name]  # what begins empty is there to be filled
+    for code in _inner(compile(tree, "", "exec", dont_inherit=True)):
+        of_function = bool(code.co_flags & inspect.CO_OPTIMIZED)
+        for name, one in [("", code)] if of_function else [(f"{code.co_name}.", method) for method in _inner(code)]:
+            text.functions.setdefault(name + one.co_name, []).append(one)
+    return text
+
+
+def _inner(code: CodeType) -> list[CodeType]:
+    return [part for part in code.co_consts if isinstance(part, CodeType)]

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .arguments import real_array, whole_number
-from .base import LatentDS, MovedDS, StableDS
+from .base import ROLLOUT_ERRORS, LatentDS, MovedDS, StableDS
 from .fidelity import FLOW_GAP_LIMIT, NEARBY_STARTS, ROUNDING_LIMIT, Excerpt, measure
 from .kernels.private import is_altered
 from .probes import flow_gap, restart_gap, round_trip_gap
@@ -156,11 +156,15 @@ class _Search:
             lines += self._invertibility(inside)
         if isinstance(self.ds, LatentDS):
             lines += [self._rate(self.ds)]
-        lines += [self._attractor()]
         if lines[0].verdict == "falsified":
-            return lines
-        with torch.no_grad():
-            self.paths = self.ds.rollout(self.starts, self.times)
+            return [*lines, self._attractor()]
+        try:
+            with torch.no_grad():
+                self.paths = self.ds.rollout(self.starts, self.times)
+        except ROLLOUT_ERRORS as error:
+            reason = f"{type(error).__name__}: {error}; motions:"
+            return [*lines, Line("motions can be computed", "falsified", len(self.starts), 0, reason)]
+        lines += [self._attractor()]
         if isinstance(self.ds, LatentDS):
             lines += self._maps(self.ds)
         lines += [self._equilibria(), self._positive(), self._descent(), *self._motions(), self._convergence()]
@@ -171,7 +175,7 @@ class _Search:
         return self._judge("velocities are finite", broken.to(self.goal), 0.5, "share that is not", self.points)
 
     def _invertibility(self, ds: LatentDS) -> list[Line]:
-        proof = ds.diffeomorphism.invertibility()
+        proof = None if is_altered(ds.diffeomorphism) else ds.diffeomorphism.invertibility()
         return [] if proof is None else [_settled(proof.claim, proof.n_checked, proof.margin, proof.detail, proof.fold)]
 
     def _rate(self, ds: LatentDS) -> Line:
@@ -190,7 +194,8 @@ class _Search:
                 farthest = torch.maximum((box[0] - goal).abs(), (box[1] - goal).abs()).unsqueeze(0)
             radius = float(torch.linalg.vector_norm(farthest, dim=-1).max())
             bound = ds.dynamics.convergence_rate_bound(radius, frame)
-            if bound is not None and 0 < bound < math.inf and not is_altered(ds.dynamics):
+            known = type(ds).forward is LatentDS.forward and not is_altered(ds) and bool(self.velocity.isfinite().all())
+            if known and bound is not None and 0 < bound < math.inf:
                 return Line(claim, "proven", 1, bound, f"least rate {where}, per second:")
             x = torch.cat([x, ds.latent_motion(self.starts, self.times).flatten(0, 1)])
             x = x[(x != goal).any(-1)]

@@ -71,7 +71,8 @@ class Excerpt:
     ruler: float
 
     def __post_init__(self) -> None:
-        point_array(self.path, "path")
+        if len(point_array(self.path, "path")) > MOST_EXCERPT_POINTS:  # aligning one takes its square in time
+            raise ValueError(f"path: expected at most {MOST_EXCERPT_POINTS} points, got {len(self.path)}")
         positive(self.duration, "duration")
         positive(self.fastest, "fastest")
         number_in(self.ruler, "ruler", 0, math.inf, ends="[)")

@@ -13,24 +13,23 @@ from .arguments import Array
 class Tabulated:
     """Something that can say its formula in numbers, by :meth:`table`.
 
-    A class says so of itself alone, and of how fast it converges likewise. A subclass may compute something else, which
-    readers of its parent's numbers would not notice; so one that does not define ``table`` has none, and one that does
-    not define ``convergence_rate_bound`` proves none, whatever its parents say.
+    A class says so of itself alone, and likewise what is proven of it (:attr:`OF_THE_CLASS_ALONE`). A subclass may
+    compute something else, which readers of its parent's numbers would not notice; so one that does not define these
+    has none, whatever its parents say.
     """
+
+    OF_THE_CLASS_ALONE = ("table", "convergence_rate_bound", "invertibility", "inverse_box")
+    """Methods that a subclass does not inherit; None is what it has instead."""
 
     def table(self, *args: Any, **keywords: Any) -> Any:
         """None: compiled code cannot compute this."""
         return None
 
-    def convergence_rate_bound(self, *args: Any, **keywords: Any) -> Any:
-        """None: nothing is proven."""
-        return None
-
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
-        for name in ("table", "convergence_rate_bound"):
-            if name not in vars(cls):
-                setattr(cls, name, getattr(Tabulated, name))
+        for name in cls.OF_THE_CLASS_ALONE:
+            if name not in vars(cls) and hasattr(cls, name):
+                setattr(cls, name, Tabulated.table)
 
 
 class LawKind(IntEnum):

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from baselines import FDM, SDSEF
-from latentds import ChebyshevDS
+from latentds import ChebyshevDS, Demonstration
 from latentds.arguments import number_in, point_array, positive, real_array, whole_number
 from latentds.testing import check_stable_ds, wavy_motion
 
@@ -145,6 +145,27 @@ def test_arrays_and_lists_are_points_too(ds):
     wanted = ds(torch.tensor([[1.0, 2.0, 3.0]]))
     for value in ([[1.0, 2.0, 3.0]], np.array([[1.0, 2.0, 3.0]]), np.array([[1, 2, 3]]), torch.tensor([[1, 2, 3]])):
         torch.testing.assert_close(ds(value), wanted, check_dtype=False, rtol=1e-6, atol=0)
+
+
+@pytest.mark.parametrize("order", [">f8", ">f4", "<f8"])
+def test_arrays_in_any_order_of_rows_and_bytes_are_points_too(ds, order):
+    values = np.arange(12.0).reshape(4, 3)
+    wanted = ds(torch.from_numpy(values))
+    turned = np.ascontiguousarray(values[::-1]).astype(order)[::-1]
+    torch.testing.assert_close(ds(turned), wanted, check_dtype=False, rtol=1e-6, atol=0)
+    assert ds.rollout(turned, np.array([0.0, 1.0])[::1]).shape == (4, 2, 3)
+
+
+def test_sparse_points_are_refused(ds):
+    with pytest.raises(ValueError, match=r"^y: expected an array of real numbers"):
+        ds(torch.eye(3).to_sparse())
+
+
+@pytest.mark.parametrize("size", [1e-300, 1e-41, 1e41, 1e200])
+def test_a_size_beyond_what_sums_of_squares_hold_is_refused_by_name(ds, size):
+    shown = wavy_motion(3)
+    with pytest.raises(ValueError, match=r"^demonstration: expected a size of 1e-40 to 1e\+40, got .*use another unit"):
+        ds.fit(Demonstration(shown.positions / shown.size * size, shown.dt))
 
 
 @pytest.mark.parametrize("recipe", ["best", None, 3, ["tuned"]])

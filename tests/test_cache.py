@@ -1,6 +1,7 @@
 """Interrupted runs go on where they stopped, and a cell that changed is not mistaken for the old one."""
 
 import functools
+import importlib
 import os
 import signal
 import sqlite3
@@ -274,6 +275,25 @@ def test_files_that_a_fit_can_reach_count_and_no_others():
         assert not [name for name in counted(TubeDS(2)) if name.startswith(apart)]
 
 
+TOOL = """
+import functools
+import numba
+
+class Tool:
+    def used(self): return 1
+    @property
+    def width(self): return 1
+    @staticmethod
+    def fixed(): return 1
+
+@numba.njit
+def compiled(x): return x
+
+@functools.cache
+def remembering(x): return x
+"""
+
+
 @pytest.fixture
 def their_package(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
@@ -283,13 +303,13 @@ def their_package(tmp_path, monkeypatch):
         "theirs/inner/__init__.py": "from . import deep", "theirs/inner/deep.py": "WIDTHS = (1, 2)",
         "theirs/method.py": "from . import helper\nfrom .inner import deep\nclass Method: pass\n"
         "def function():\n    from theirs import lazy\n",
-        "alone.py": "def helper(x): return helped * x\nhelped = 1\nclass Alone: pass\n",
-        "calling.py": "from alone import helper\ndef calls(x): return helper(x)\n",
+        "tools.py": "", "alone.py": "def helper(x): return helped * x\nhelped = 1\nclass Alone: pass\n" + TOOL,
+        "calling.py": "from alone import helper\nimport tools as tools\ndef calls(x): return helper(x)\n",
     }  # fmt: skip
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     yield tmp_path
-    for name in [name for name in sys.modules if name.partition(".")[0] in ("theirs", "alone", "calling")]:
+    for name in [name for name in sys.modules if name.partition(".")[0] in ("theirs", "alone", "calling", "tools")]:
         del sys.modules[name]
 
 
@@ -321,6 +341,63 @@ def test_files_of_a_methods_package_count_if_the_method_imports_them(their_packa
     assert changed(lambda: monkeypatch.setattr(theirs.helper, "RATE", 2.0)) == {"Method", "function"}
     assert changed(lambda: monkeypatch.setattr(theirs.inner.deep, "WIDTHS", [1, 2])) == {"Method", "function"}
     assert changed(lambda: monkeypatch.setattr("alone.helped", 2)) == {"Alone", "calls"}
+
+
+REPLACEMENTS = {
+    "a function": ("alone.helper", lambda x: 7),
+    "a function that others import by name": ("calling.helper", lambda x: 7),
+    "a function by a callable": ("alone.helper", functools.partial(max, 7)),
+    "a method": ("alone.Tool.used", lambda self: 7),
+    "a property": ("alone.Tool.width", property(lambda self: 7)),
+    "a static method": ("alone.Tool.fixed", staticmethod(lambda: 7)),
+    "a class": ("alone.Tool", Gain),
+    "an imported module": ("calling.tools", sys),
+    "a compiled function": ("alone.compiled", numba.njit(closing_over(7))),
+    "a function with a memory": ("alone.remembering", functools.cache(closing_over(7))),
+}
+
+
+@pytest.mark.parametrize("what", REPLACEMENTS)
+def test_what_was_replaced_in_a_module_counts(their_package, monkeypatch, what):
+    from calling import calls
+
+    before, (place, value) = fingerprint(calls), REPLACEMENTS[what]
+    with monkeypatch.context() as patched:
+        patched.setattr(place, value)
+        after = fingerprint(calls)
+        assert after == fingerprint(calls)
+    assert after != before == fingerprint(calls)
+
+
+def test_what_this_library_was_made_to_do_counts(monkeypatch):
+    before = fingerprint(TubeDS(2))
+    monkeypatch.setattr("latentds.methods.tube.refuse_crossings", lambda *_: None)
+    assert fingerprint(TubeDS(2)) != before
+
+
+def test_an_edit_after_the_import_gives_a_key_of_its_own_until_all_is_loaded_anew(their_package):
+    import alone
+    import calling
+
+    before = fingerprint(calling.calls)
+    text = (their_package / "alone.py").read_text()
+    (their_package / "alone.py").write_text(text.replace("helped * x", "helped * x * 2"))
+    old_code = fingerprint(calling.calls)
+    importlib.reload(alone)
+    old_import = fingerprint(calling.calls)
+    importlib.reload(calling)
+    new = fingerprint(calling.calls)
+    assert len({before, old_code, old_import, new}) == 4
+    code = "import calling; from latentds.cache import fingerprint; print(fingerprint(calling.calls))"
+    paths = os.pathsep.join([str(their_package), os.getcwd()])
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": paths},
+    )
+    assert done.stdout.strip() == new
 
 
 def test_a_constant_of_this_library_that_was_changed_counts_for_all(monkeypatch):
@@ -357,6 +434,11 @@ def test_frozen_and_tied_parameters_count():
     assert len({layers(), layers(lambda module: module[0].requires_grad_(False)), layers(tie)}) == 3
 
 
+class Config(dict):
+    def __init__(self, rate):
+        self.rate = rate
+
+
 def test_unusual_buffers_and_names_can_be_read():
     masked = [np.ma.masked_array([1.0, 2.0], mask) for mask in ([True, False], [False, True])]
     plain = torch.eye(3)
@@ -368,6 +450,9 @@ def test_unusual_buffers_and_names_can_be_read():
         "\ud800",
         2**63,
         *masked,
+        Config(1e-2),
+        Config(1e-3),
+        {},
     ]
     assert len({fingerprint(thing) for thing in things}) == len(things)
 

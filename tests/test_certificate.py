@@ -87,7 +87,9 @@ class RestsElsewhereTangentially(Sound):
 
 
 class Unbounded(LocallyWeightedTranslations):
-    """μ > 1: layers reach 1.5 times as far as they may."""
+    """μ > 1: layers reach 1.5 times as far as they may, and a class that vouches for the bound of its parent's."""
+
+    invertibility = LocallyWeightedTranslations.invertibility
 
     @property
     def directions(self):
@@ -556,13 +558,76 @@ def test_nothing_is_proven_of_what_is_not_the_code_that_the_proof_is_about(chang
     assert ds.tables() is None or change is with_other_dynamics
 
 
+class Bent(LocallyWeightedTranslations):
+    """A map of which its parent's margins and bounds say nothing."""
+
+    def forward(self, x):
+        return super().forward(x) + 0.1 * torch.sin(x)
+
+
+def with_another_map(ds):
+    psi = Bent(ds.dim, ds.diffeomorphism.n_layers)
+    psi.load_state_dict(ds.diffeomorphism.state_dict())
+    ds.diffeomorphism = psi
+
+
+def with_a_hook_on_the_map(ds):
+    ds.diffeomorphism.register_forward_hook(lambda module, inputs, y: 1.0 * y)
+
+
+@pytest.mark.parametrize("change", [with_another_map, with_a_hook_on_the_map])
+def test_no_map_is_proven_invertible_that_is_not_the_code_that_the_proof_is_about(change):
+    ds = TubeDS(2, n_layers=40, refined=False, homotopy="linear").fit(wavy_motion(2))
+    assert sum("invertible" in line.claim for line in certify(ds, n_samples=50).lines) == 1
+    change(ds)
+    assert not [line for line in certify(ds, n_samples=50).lines if "invertible" in line.claim]
+
+
+def with_a_hook_on_the_velocity(ds):
+    ds.register_forward_hook(lambda module, inputs, velocity: 0.5 * velocity)
+
+
+def with_a_velocity_of_its_own(ds):
+    honest = ds.forward
+    ds.forward = lambda y: 0.5 * honest(y)
+
+
+@pytest.mark.parametrize("change", [with_a_hook_on_the_velocity, with_a_velocity_of_its_own])
+def test_no_rate_is_proven_of_another_velocity_field(change):
+    ds = TubeDS(2, n_layers=40, refined=False, homotopy="linear").fit(wavy_motion(2))
+    change(ds)
+    certificate = certify(ds, n_samples=50)
+    assert not [line for line in certificate.lines if line.verdict == "proven" and "rate" in line.claim]
+    assert "motions are the field's integral" in {line.claim for line in certificate.falsified}
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0])
+def test_a_moved_system_that_stands_still_or_runs_back_is_falsified(speed):
+    moved = TubeDS(2, n_layers=40, refined=False, homotopy="linear").fit(wavy_motion(2)).slowed(2.0)
+    moved.similarity.speed.fill_(speed)
+    assert not certify(moved, n_samples=50).holds
+
+
+class CannotMove(StandsStillOnALine):
+    def rollout(self, y0, t):
+        raise RuntimeError("out of order")
+
+
+def test_a_system_whose_motions_raise_is_falsified_and_says_what():
+    certificate = certify(CannotMove(2, 1, 0.5), [[-1, -1], [1, 1]], n_samples=50)
+    (line,) = certificate.falsified
+    assert line.claim == "motions can be computed"
+    assert "RuntimeError: out of order" in str(line)
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", ["centers", "log_widths", "strengths"])
-def test_a_parameter_that_is_no_number_is_nowhere_left_out(name, tmp_path):
+def test_a_parameter_that_is_no_number_is_nowhere_left_out(name, number, tmp_path):
     shown = wavy_motion(3)
     ds = TubeDS(3, n_layers=40, refined=False).fit(shown)
     y = shown.positions[::20].clone().requires_grad_()
     with torch.no_grad():
-        getattr(ds.diffeomorphism, name)[5] = math.nan
+        getattr(ds.diffeomorphism, name)[5] = number
     for answer in (ds(y), ds.lyapunov(y), ds.rollout(y, torch.tensor([0.0, 1.0]))[:, 1]):
         assert bool(torch.isnan(answer).all())
     with reference():

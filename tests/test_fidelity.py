@@ -561,6 +561,7 @@ def test_an_excerpt_keeps_what_it_needs():
     [
         ({"path": ((0.0, 1.0), (0.0, float("nan")), (1.0, 1.0))}, "path: expected finite numbers"),
         ({"path": ()}, "path: expected shape"),
+        ({"path": tuple((float(i), 0.0) for i in range(1001))}, "path: expected at most 1000 points, got 1001"),
         ({"duration": 0.0}, "duration: expected a finite number > 0"),
         ({"fastest": -1.0}, "fastest: expected a finite number > 0"),
         ({"ruler": -1.0}, "ruler: expected a number in"),

@@ -190,6 +190,10 @@ def settings(**changes):
     return ChebyshevDS(2, n_layers=3).settings | changes
 
 
+def inside(dim):
+    return {"class": "ChebyshevDS", "settings": settings(dim=dim, n_layers=1)}
+
+
 BAD = {
     "pickle": (lambda p: p.write_bytes(pickle.dumps(Explosive())), "not a readable safetensors file"),
     "torch.save": (lambda p: torch.save({"a": Explosive()}, p), "not a readable safetensors file"),
@@ -234,6 +238,16 @@ BAD = {
     ),
     "absurd dim": (
         lambda p: written(p, settings=settings(dim=10**12)),
+        "expected sizes that .* stored numbers can fill",
+    ),
+    "absurd dim of what is moved": (
+        lambda p: written(p, **{"class": "MovedDS", "settings": {"ds": inside(16_000)}}),
+        "expected sizes that .* stored numbers can fill",
+    ),
+    "absurd dim of what is moved twice": (
+        lambda p: written(
+            p, **{"class": "MovedDS", "settings": {"ds": {"class": "MovedDS", "settings": {"ds": inside(16_000)}}}}
+        ),
         "expected sizes that .* stored numbers can fill",
     ),
     "absurd layers": (lambda p: written(p, settings=settings(n_layers=10**9)), "expected sizes that .* can fill"),
