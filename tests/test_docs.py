@@ -8,8 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from latentds import fidelity
+
 ROOT = Path(__file__).parent.parent
 BLOCK = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+RELIABILITY = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
+TEST_NAMED = re.compile(r"`(test_\w+)::(test_\w+)`")
 
 
 def blocks():
@@ -58,3 +62,56 @@ def resolves(name):
 def test_names_that_lead_nowhere_are_seen():
     assert resolves("latentds.testing.check_stable_ds")
     assert not resolves("latentds.kernels.serves")
+
+
+def test_every_test_that_reliability_names_exists():
+    named, found = set(TEST_NAMED.findall(RELIABILITY)), set()
+    for file in (ROOT / "tests").rglob("test_*.py"):
+        tests = re.findall(r"^ *def (test_\w+)\(", file.read_text(encoding="utf-8"), re.MULTILINE)
+        found.update((file.stem, name) for name in tests)
+    assert named
+    assert named <= found, sorted(named - found)
+
+
+def unheld(page):
+    """Paragraphs, list items and rows below the first "##" that name no test and do not say so.
+
+    What ends with a colon only leads to a list, a table or a program.
+    """
+    page = re.sub(r"^```.*?^```$", "", page, flags=re.MULTILINE | re.DOTALL)
+    page = re.sub(r"^\|.*\|\n\|[-:|]+\|$", "", page, flags=re.MULTILINE)  # heads of tables
+    for section in re.split(r"^## .*$", page, flags=re.MULTILINE)[1:]:
+        for block in re.split(r"\n\n+|\n(?=\||\* )", section):
+            text = block.strip()
+            told = TEST_NAMED.search(text) or re.search(r"\bno\s+test\b", text)
+            if text and not text.endswith(":") and not told:
+                yield text
+
+
+def test_every_promise_of_reliability_names_its_test():
+    assert list(unheld(RELIABILITY)) == []
+
+
+def test_a_promise_without_a_test_is_seen():
+    held = "Held (`test_a::test_b`)."
+    page = f"# Page\n\nIntroduces.\n\n## Section\n\nIs a lead:\n\n```sh\ncode\n```\n\n{held} And\nmore.\n\nBare.\n\n"
+    page += f"* {held}\n* An item (no\n  test).\n* A bare item.\n\n|a|b|\n|---|---|\n|row|{held}|\n|bare|row|\n"
+    assert list(unheld(page)) == ["Bare.", "* A bare item.", "|bare|row|"]
+
+
+def test_limits_of_fidelity_are_the_ones_that_are_told():
+    rows = re.findall(r"^\|`(\w+)`\|[^|]*\|((?:above|outside) [^|]*)\|", RELIABILITY, re.MULTILINE)
+    told = {figure: [float(number) for number in re.findall(r"[\d.]+", limit)] for figure, limit in rows}
+    assert told == {
+        "miss": [fidelity.MISS_LIMIT],
+        "length_ratio": [fidelity.LEAST_LENGTH_RATIO, fidelity.LARGEST_LENGTH_RATIO],
+        "end": [fidelity.END_LIMIT],
+        "nearby": [fidelity.NEARBY_LIMIT],
+        "fastest": [fidelity.SPEED_LIMIT],
+        "rise": [fidelity.ROUNDING_LIMIT],
+        "restart_gap": [fidelity.ROUNDING_LIMIT],
+        "timing": [fidelity.TIMING_LIMIT],
+        "flow_gap": [fidelity.FLOW_GAP_LIMIT],
+        "latent_error": [fidelity.ROUNDING_LIMIT],
+    }
+    assert told.keys() == fidelity.Fidelity.__dataclass_fields__.keys() - {"spread", "shown"}
