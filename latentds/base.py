@@ -173,7 +173,7 @@ class StableDS(nn.Module, ABC):
             ValueError: if this is no demonstration that the method can learn from.
 
         Warns:
-            FitWarning: if the system does not follow what it was shown.
+            FitWarning: if the system does not follow what it was shown, or may not follow a coordinate of another unit.
         """
         shown = demonstrations_of(demonstration, self.dim)
         with _restored_on_failure(self):
@@ -181,8 +181,9 @@ class StableDS(nn.Module, ABC):
             self.fit_report = report
             off = report.notes[-1:] if report.fidelity is None else report.fidelity.notes
             if off:
-                text = f"{type(self).__name__} does not follow what it was shown: {'; '.join(off)}"
-                warnings.warn(text, FitWarning, stacklevel=2)
+                follows = report.fidelity is not None and report.fidelity.follows
+                verdict = "follows what it was shown, but" if follows else "does not follow what it was shown:"
+                warnings.warn(f"{type(self).__name__} {verdict} {'; '.join(off)}", FitWarning, stacklevel=2)
         return self
 
     @abstractmethod

@@ -9,6 +9,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
+from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from .arguments import Array, number_in, point_array, positive
@@ -36,6 +37,9 @@ FLOW_GAP_LIMIT = 0.05
 """Distance of a rollout from the integral of the velocity field, in sizes; sound fits stay below a third."""
 TIMING_LIMIT = 0.05
 """Mean distance from the demonstration at equal times, in sizes: neither DTW nor a length sees too fast a motion."""
+COORDINATE_LIMIT, CONSTANT_WITHIN = 0.15, 1e-4
+"""A coordinate that is missed by so much of its own range is hardly followed; one that moves by less than the second
+number, in sizes, rests."""
 
 NEARBY_STARTS = 8
 """Motions from nearby starts."""
@@ -130,6 +134,7 @@ class Fidelity:
         timing: mean distance of that motion from the demonstration at equal times, in sizes, after the best shift by up
             to a tenth of the duration, as one that starts to move a little later. Of several demonstrations, which one
             system cannot all keep the times of, each counts in the mean of their durations.
+        coordinate: mean miss of one coordinate, over its own range: the worst of those that move by more than noise.
         latent_error: see :meth:`~latentds.LatentDS.latent_error`; 0 for a system without latent space.
         spread: of several demonstrations, the largest distance of a goal from the mean of their goals, in sizes. One
             attractor cannot be nearer to all of them, so it is added to what ``end`` may be.
@@ -145,6 +150,7 @@ class Fidelity:
     restart_gap: float
     flow_gap: float = 0.0
     timing: float = 0.0
+    coordinate: float = 0.0
     latent_error: float = 0.0
     spread: float = 0.0
     shown: tuple[Excerpt, ...] = field(default=(), repr=False)
@@ -152,12 +158,18 @@ class Fidelity:
     @property
     def follows(self) -> bool:
         """Whether nothing is off."""
-        return not self.notes
+        return all(badness <= 1 for badness, _ in self.findings)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is off, in words, the worst first."""
-        return tuple(words for badness, words in sorted(self.findings, reverse=True) if not badness <= 1)
+        """What is off, in words, the worst first; then what may be, if the coordinates have different units."""
+        off = [words for badness, words in sorted(self.findings, reverse=True) if not badness <= 1]
+        if not self.coordinate <= COORDINATE_LIMIT:
+            off.append(
+                f"a coordinate that moves little is missed by {self.coordinate:.3g} of its own range: if its unit is "
+                "another one, such as rad beside mm, scale the coordinates to like ranges before the fit"
+            )
+        return tuple(off)
 
     @property
     def findings(self) -> tuple[tuple[float, str], ...]:
@@ -241,6 +253,17 @@ def _timing_gap(motion: Array, lasts: float, path: Array, duration: float) -> fl
     return float(np.linalg.norm(later - path, axis=-1).mean(-1).min())
 
 
+def _worst_coordinate(motion: Array, path: Array, still: float) -> float:
+    """The largest mean miss of one coordinate, over its range, among those that move by more than ``still``.
+
+    Missed where the motion is nearest in all coordinates together, which those of the largest unit decide.
+    """
+    ranges = np.ptp(path, axis=0)
+    apart = motion[cdist(path, motion).argmin(1)] - path
+    missed = np.abs(apart).mean(0)[ranges > still] / ranges[ranges > still]
+    return float(np.max(missed, initial=0.0))
+
+
 def _measure(
     ds: System, one: Excerpt, path: Array, duration: float, pace: float, around: Array, ball: Array
 ) -> dict[str, float]:
@@ -265,6 +288,7 @@ def _measure(
         "nearby": float(np.max(missed[1:], initial=0.0)),
         "fastest": float(torch.linalg.vector_norm(velocity, dim=-1).max()) / one.fastest,
         "timing": _timing_gap(motions[0], duration, path, pace * one.duration) / size,
+        "coordinate": _worst_coordinate(motions[0], path, max(one.ruler, CONSTANT_WITHIN * size)),
         "rise": float(energy.diff().max() / energy[0]),
         "restart_gap": float(restart_gap(ds, moved[0], times)) / size,
         "flow_gap": float(flow_gap(ds, starts[:3], times, FLOW_GAP_LIMIT / 2 * size).max()) / size,

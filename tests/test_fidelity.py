@@ -449,6 +449,22 @@ def test_what_a_robot_runs_is_what_is_judged(hooked):
     assert "motions are the field's integral" in {line.claim for line in certify(ds, n_samples=40).falsified}
 
 
+def test_a_coordinate_of_another_unit_that_is_hardly_followed_is_told():
+    """Radians beside millimetres: what is nothing of the size is half of the joint's range."""
+    s = np.linspace(0, 1, 200) ** 2 * (3 - 2 * np.linspace(0, 1, 200))
+    mixed = np.stack([300 * s, 200 * np.sin(2 * s), 0.8 * np.sin(12 * s)], axis=1)
+    with pytest.warns(
+        FitWarning, match=r"ChebyshevDS follows .*, but a coordinate that moves little is missed by 0\.2"
+    ):
+        report = ChebyshevDS(3, n_layers=10).fit(Demonstration(mixed, 0.01)).fit_report
+    assert report.fidelity.follows
+    assert "scale the coordinates to like ranges" in report.notes[-1]
+    report = ChebyshevDS(3, n_layers=200).fit(Demonstration(mixed, 0.01)).fit_report
+    assert report.notes == ()
+    resting = np.stack([mixed[:, 0], mixed[:, 1], 1e-3 * mixed[:, 2]], axis=1)
+    assert ChebyshevDS(3, n_layers=10).fit(Demonstration(resting, 0.01)).fit_report.notes == ()
+
+
 @pytest.mark.parametrize(
     "learned", [Learned(np.float32(0.5), np.int64(3), [np.float32(1)]), Learned(torch.tensor(0.5), 3, (1,))]
 )
