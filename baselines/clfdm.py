@@ -135,7 +135,7 @@ class AsymmetricQuadratics(nn.Module):
     @torch.no_grad()
     def begin(self, points: Tensor) -> None:
         """Spread the centers along points (N, n)."""
-        places = torch.linspace(0, len(points) - 1, len(self.centers) + 2)[1:-1].round().long()
+        places = torch.linspace(0, len(points) - 1, len(self.centers) + 2, dtype=torch.float64)[1:-1].round().long()
         self.centers.copy_(points[places])
 
     def forward(self, z: Tensor) -> Tensor:

@@ -99,8 +99,8 @@ class _Push(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable  # type: ignore[untyped-decorator]
     def backward(ctx: Any, to_pushed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        shapes = [part.shape for part in ctx.seen[1:]]
-        results = to_pushed.contiguous().clone(), torch.zeros(shapes[0]), torch.zeros(shapes[1])
+        to_scale, to_slope = (torch.zeros(part.shape, dtype=torch.float32) for part in ctx.seen[1:])
+        results = to_pushed.contiguous().clone(), to_scale, to_slope
         _push_backward(*ctx.seen, *(part.numpy() for part in results))
         return results
 

@@ -75,7 +75,8 @@ class DMP(PhaseDriven):
             lengths = torch.linalg.vector_norm(bent, dim=0)
             bent = torch.cat([bent / lengths, math.sqrt(RIDGE_WEIGHT) * torch.eye(self.n_basis, dtype=torch.float64)])
             wanted = torch.cat([wanted, wanted.new_zeros(self.n_basis, self.dim)])
-            fresh.weights.copy_(torch.linalg.lstsq(bent, wanted, driver="gelsd").solution / lengths[:, None])
+            solved, *_ = np.linalg.lstsq(bent.numpy(), wanted.numpy())  # torch's rounds by how many threads it has
+            fresh.weights.copy_(torch.from_numpy(solved) / lengths[:, None])
             self.load_state_dict(fresh.state_dict())
         return self._learned(shown, self.n_basis)
 

@@ -102,7 +102,7 @@ class ProMP(PhaseDriven):
 
 def basis(n_basis: int, s: Tensor) -> tuple[Tensor, Tensor]:
     """φ and dφ/ds at phases (T,): (T, B) each. Neighbours meet at exp(-½) of their height."""
-    centers = torch.linspace(0, 1, n_basis).to(s)
+    centers = torch.linspace(0, 1, n_basis, dtype=s.dtype, device=s.device)
     offsets = (s.unsqueeze(-1) - centers) * (n_basis - 1) / 2
     slopes = -2 * offsets * (n_basis - 1) / 2
     values = torch.softmax(-offsets.square(), dim=-1)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
+from contextlib import contextmanager
+
 import pytest
 import torch
 
+import baselines
 from baselines import FDM, SDSEF
 from latentds import ChebyshevDS, Demonstration, TubeDS
 from latentds.testing import parametrize_stable_ds, wavy_motion
@@ -46,3 +50,30 @@ def test_random_state_is_untouched(method):
     before = torch.get_rng_state()
     METHODS[method](2).fit(wavy_motion(2))
     assert torch.equal(before, torch.get_rng_state())
+
+
+@contextmanager
+def set_while(setter, value, before):
+    setter(value)
+    try:
+        yield
+    finally:
+        setter(before)
+
+
+@pytest.mark.parametrize("name", [*sorted(set(baselines.__all__) - {"FDM", "SDSEF"}), *METHODS])
+def test_neither_torchs_default_dtype_nor_its_threads_change_a_fit(name):
+    def fitted():
+        return factory(2).fit(shown).state_dict()
+
+    kind, shown = getattr(baselines, name, FDM), wavy_motion(2)
+    few = {key: value for key, value in {"epochs": 10, "seed": 0}.items() if key in inspect.signature(kind).parameters}
+    factory = METHODS.get(name, lambda dim: kind(dim, **few))
+    wanted = fitted()
+    with set_while(torch.set_default_dtype, torch.float64, torch.float32):
+        doubled = fitted()
+    with set_while(torch.set_num_threads, 3 - min(torch.get_num_threads(), 2), torch.get_num_threads()):
+        spread = fitted()
+    for part, values in wanted.items():
+        assert torch.equal(values, doubled[part]), part
+        assert torch.equal(values, spread[part]), part
