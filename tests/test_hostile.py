@@ -140,7 +140,9 @@ def test_the_fuzzer_tells_a_broken_promise(monkeypatch):
         assert "1  BROKEN" in summary([(PLAIN, found, 0.1)])
 
 
-@pytest.mark.parametrize("seed", [0, 1])  # goals apart, and one goal
+@pytest.mark.parametrize(
+    "seed", [pytest.param(0, id="goals apart", marks=pytest.mark.slow), pytest.param(1, id="one goal")]
+)
 def test_several_start_apart_and_are_each_followed(seed):
     case = PLAIN._replace(method="TubeDS", n_shown=3, apart=0.04, seed=seed)
     shown = case.shown()
