@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import copy
 import multiprocessing
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import seed as seeded
 
 from baselines import FDM, SDSEF
-from experiments.fuzz import FLAWS, FOLLOWS, METHODS, SAYS, SHAPES, SLOW, Case, cases, outcome, summary
-from latentds import ChebyshevDS, Demonstration, TubeDS, datasets
+from experiments import tampering
+from experiments.fuzz import FOLLOWS, SAYS, _missed, outcome, summary
+from experiments.hostile import FLAWS, METHODS, SHAPES, SLOW, Case, cases
+from experiments.tampering import TAMPERINGS
+from latentds import ChebyshevDS, Demonstration, StableDS, TubeDS, datasets
+from latentds.certificate import Certificate, Line
 from latentds.testing import wavy_motion
 
 
@@ -132,6 +138,110 @@ def test_the_fuzzer_tells_a_broken_promise(monkeypatch):
         assert found.startswith("BROKEN")
         assert message in found
         assert "1  BROKEN" in summary([(PLAIN, found, 0.1)])
+
+
+@pytest.mark.parametrize(
+    "seed", [pytest.param(0, id="goals apart", marks=pytest.mark.slow), pytest.param(1, id="one goal")]
+)
+def test_several_start_apart_and_are_each_followed(seed):
+    case = PLAIN._replace(method="TubeDS", n_shown=3, apart=0.04, seed=seed)
+    shown = case.shown()
+    apart = [torch.linalg.vector_norm(one.positions - shown[0].positions, dim=-1) / shown[0].size for one in shown]
+    for gaps in apart[1:]:
+        assert float(gaps[0]) == pytest.approx(0.04)
+        assert float(gaps[-1]) == pytest.approx(0 if seed else 0.04, abs=1e-12)
+    assert outcome(case) == FOLLOWS
+
+
+def test_no_other_demonstration_excuses_a_misfit(monkeypatch):
+    class FirstAlone(FDM):
+        def _learn_and_measure(self, shown, progress):
+            return super()._learn_and_measure(shown[:1], progress)
+
+    monkeypatch.setitem(METHODS, "broken", lambda dim: FirstAlone(dim, n_layers=40))
+    found = outcome(PLAIN._replace(method="broken", n_shown=3, apart=0.5))
+    assert found.startswith("BROKEN a silent misfit off by")
+
+
+@pytest.mark.parametrize(
+    ("aside", "share", "told"), [(0.0, 1.0, ""), (0.0, 0.9, "0.1"), (0.1, 0.9, ""), (0.1, 0.7, "0.3")]
+)
+def test_goals_apart_excuse_no_more_than_the_end(aside, share, told):
+    line = np.linspace(0, 1, 100)[:, None] * np.array([1.0, 0.0])
+    shown = [Demonstration(line + offset, 0.01) for offset in ([0, aside], [0, -aside])]
+    paths = torch.stack([one.start + share * (one.positions - one.start) for one in shown])
+    assert _missed(shown, paths) == (f"off by {told} of the size at its end" if told else "")
+
+
+@pytest.fixture(scope="module")
+def followed():
+    case = PLAIN._replace(method="FDM")
+    return METHODS["FDM"](case.dim).fit(case.shown())
+
+
+def tampered(kind, ds):
+    return TAMPERINGS[kind](copy.deepcopy(ds), PLAIN.shown(), np.random.default_rng(0))
+
+
+CHANGED = [kind for kind in TAMPERINGS if " by " in kind]
+OTHER_CODE = [kind for kind in CHANGED if "dynamics" in kind or ("fast" in kind and "subclass" in kind)]
+
+
+@pytest.mark.filterwarnings("ignore:compare. 1 of 2 rows failed")
+@pytest.mark.parametrize("kind", ["turned by a subclass", OTHER_CODE[0], "nan in it", "reports a mute error"])
+def test_what_is_promised_of_tampering_holds(kind, followed):
+    assert tampered(kind, followed) == ""
+
+
+def certificate(*lines):
+    made = tuple(Line(claim, verdict, 1, 1.0, "") for claim, verdict in lines)
+    return lambda ds, n_samples: Certificate("", 2, ((), ()), 10, 0, made)
+
+
+FALSIFIED = ("follows its demonstration", "falsified")
+PROVEN = ("latent motions approach the goal", "proven")
+
+
+def test_the_fuzzer_tells_what_is_not_said_of_tampering(followed, monkeypatch):
+    assert len(CHANGED) == 11
+    monkeypatch.setattr(tampering, "certify", certificate())
+    for kind in CHANGED:
+        assert tampered(kind, followed) == "a certificate that says that it follows", kind
+    assert tampered("nan in it", followed).startswith("a certificate that does not say first")
+    found = outcome(PLAIN._replace(tampering="turned by a hook"))
+    assert found == "BROKEN after tampering, turned by a hook: a certificate that says that it follows"
+    monkeypatch.setattr(tampering, "certify", certificate(FALSIFIED, PROVEN))
+    assert len(OTHER_CODE) == 3
+    for kind in CHANGED:
+        assert (tampered(kind, followed) == "a rate that is proven of other code") == (kind in OTHER_CODE), kind
+    monkeypatch.setattr(StableDS, "controller", lambda ds: lambda y: 0 * y)
+    assert tampered("halved by a hook", followed) == "a controller that runs another field"
+
+
+def test_the_fuzzer_tells_a_number_that_is_left_out(followed, monkeypatch):
+    monkeypatch.setattr(StableDS, "save", lambda ds, path: None)
+    assert tampered("nan in it", followed).startswith("a controller or a file with nan in ")
+    monkeypatch.setattr(FDM, "forward", lambda ds, y: torch.ones_like(y) * (1 + ds.dynamics.law.speeds.isnan().any()))
+    monkeypatch.setattr(FDM, "state_dict", lambda ds: {"speeds": ds.dynamics.law.speeds}, raising=False)
+    assert tampered("nan in it", followed) == "velocities of another system with nan in speeds"
+
+
+@pytest.mark.parametrize(
+    ("kind", "bad", "good", "told"),
+    [
+        ("nothing", ("failed", "no", 1.0), ("ok", "", 1.0), ""),
+        ("nothing", ("failed", "", 1.0), ("ok", "", 1.0), "rows that do not say 'failed'"),
+        ("nothing", ("ok", "", 1.0), ("ok", "", 1.0), "rows that do not say 'failed'"),
+        ("nothing", ("failed", "no", 1.0), ("failed", "no", 1.0), "another method's rows fail with it"),
+        ("tensors", ("failed", "no", 1.0), ("ok", "", 1.0), "rows that do not say 'ok'"),
+        ("tensors", ("ok", "", 2.0), ("ok", "", 1.0), "rows that are not right"),
+    ],
+)
+def test_the_fuzzer_tells_rows_that_are_wrong(kind, bad, good, told, followed, monkeypatch):
+    rows = pd.DataFrame([("bad", *bad), ("good", *good)], columns=["method", "status", "error", "dtw"])
+    monkeypatch.setattr(tampering, "compare", lambda *_, **__: rows.assign(mse=0.5, n_layers=3, follows=True))
+    assert tampered(f"reports {kind}", followed).startswith(told)
+    assert bool(tampered(f"reports {kind}", followed)) == bool(told)
 
 
 def test_the_summary_counts_each_end_of_each_method():
