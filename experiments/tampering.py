@@ -130,7 +130,7 @@ def _not_finite(number: float, ds: StableDS, shown: Shown, draw: Draw) -> str:
         after = ds(shown[0].positions)
     if bool((after.isfinite() & ((after - before).abs() > 1e-6 * before.abs().max())).any()):
         return f"velocities of another system with {number} in {name}"
-    if [line.claim for line in certify(ds, n_samples=10).falsified][:1] != ["velocities are finite"]:
+    if [line.claim for line in certify(ds, n_samples=10).falsified][:1] != ["parameters and velocities are finite"]:
         return f"a certificate that does not say first that velocities are not finite, with {number} in {name}"
     with tempfile.TemporaryDirectory() as folder:
         for use in (StableDS.controller, lambda ds: ds.save(Path(folder) / "never")):

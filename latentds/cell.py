@@ -36,9 +36,6 @@ CONVERGED_WITHIN = 1e-2
 ON_GOAL = 1e-6
 """``converged``: largest distance of the attractor from the demonstrated goal, as a share of the motion's size."""
 
-FAILURES = (Exception, SystemExit, GeneratorExit)
-"""What a method may raise without ending the comparison; Ctrl-C ends it."""
-
 SCORES = (
     "dtw", "dtw_fast", "dtw_per_point", "dtw_fast_per_point", "frechet", "endpoint_error", "path_length_ratio",
     "velocity_rmse", "velocity_cosine", "mse", "n_parameters", "n_layers", "fit_seconds", "rollout_seconds",
@@ -200,7 +197,9 @@ def evaluate(cell: Cell, protocol: RolloutProtocol) -> Outcome:
                 warnings.simplefilter("ignore", FitWarning)  # the rows say it
                 ds.fit(cell.shown[0] if len(cell.shown) == 1 else list(cell.shown))
             seconds = time.perf_counter() - began
-    except FAILURES as raised:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as raised:
         return _outcome(cell, protocol, error=raised)
     return judge(ds, cell, protocol, fit_seconds=seconds)
 
@@ -239,7 +238,9 @@ def judge(ds: StableDS, cell: Cell, protocol: RolloutProtocol, *, fit_seconds: f
             if path.shape != wanted:
                 raise ValueError(f"rollout: expected shape {wanted}, got {tuple(path.shape)}")
         paths = np.array([path.numpy() for path in moved], dtype=np.float64)
-    except FAILURES as raised:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as raised:
         return _outcome(cell, protocol, facts, of_judge, error=raised)
     return _outcome(cell, protocol, facts, of_judge, follows, converged, paths)
 
@@ -281,7 +282,9 @@ def _outcome(
 def _reason(error: BaseException) -> str:
     try:
         text = str(error)
-    except Exception:
+    except KeyboardInterrupt:
+        raise
+    except BaseException:
         text = "an error that cannot say what it is"
     return f"{type(error).__name__}: {text}".encode("utf-8", "backslashreplace").decode()
 

@@ -141,6 +141,7 @@ class _Search:
             speed = torch.linalg.vector_norm(self.velocity, dim=-1)
         finite = speed[torch.isfinite(speed)]
         self.speed = max(float(finite.median()) if len(finite) else 0.0, torch.finfo(self.goal.dtype).tiny)
+        self.numbers = all(bool(torch.isfinite(values).all()) for values in ds.state_dict().values())
         self.shown = _shown(ds)
         self.duration = self.shown[0].duration if self.shown else min(self.size / self.speed, 1e30)
         demonstrated = torch.tensor([one.path[0] for one in self.shown], dtype=torch.float64).reshape(-1, ds.dim)
@@ -154,6 +155,8 @@ class _Search:
             inside = inside.ds
         if isinstance(inside, LatentDS):
             lines += self._invertibility(inside)
+        if not self.numbers:
+            return lines
         if isinstance(self.ds, LatentDS):
             lines += [self._rate(self.ds)]
         if lines[0].verdict == "falsified":
@@ -171,8 +174,9 @@ class _Search:
         return [*lines, self._follows()] if self.shown else lines
 
     def _finite(self) -> Line:
-        broken = ~torch.isfinite(self.velocity).all(-1)
-        return self._judge("velocities are finite", broken.to(self.goal), 0.5, "share that is not", self.points)
+        broken = ~torch.isfinite(self.velocity).all(-1) | (not self.numbers)  # which no sample may show
+        claim = "parameters and velocities are finite"
+        return self._judge(claim, broken.to(self.goal), 0.5, "share that is not", self.points)
 
     def _invertibility(self, ds: LatentDS) -> list[Line]:
         proof = None if is_altered(ds.diffeomorphism) else ds.diffeomorphism.invertibility()
@@ -194,7 +198,7 @@ class _Search:
                 farthest = torch.maximum((box[0] - goal).abs(), (box[1] - goal).abs()).unsqueeze(0)
             radius = float(torch.linalg.vector_norm(farthest, dim=-1).max())
             bound = ds.dynamics.convergence_rate_bound(radius, frame)
-            known = type(ds).forward is LatentDS.forward and not is_altered(ds) and bool(self.velocity.isfinite().all())
+            known = type(ds).forward is LatentDS.forward and not is_altered(ds)
             if known and bound is not None and 0 < bound < math.inf:
                 return Line(claim, "proven", 1, bound, f"least rate {where}, per second:")
             x = torch.cat([x, ds.latent_motion(self.starts, self.times).flatten(0, 1)])
@@ -311,9 +315,10 @@ class _Search:
             every = torch.cat([self.points, y, slow])
             relative = torch.cat([relative, left_over.amin(0)[rows], slowness])
         away = torch.linalg.vector_norm(every - self.goal, dim=-1) > 1e-4 * self.size
-        # Still moving: the limit is far beyond any pause that a fit leaves in a motion.
-        durations, claim = 1 / relative[away], "no equilibrium but the attractor"
-        return self._judge(claim, durations, 1e10, "largest slowness", every[away])
+        # Beside the field's own pace, since one may be slow as a whole; far beyond any pause that a fit leaves in it.
+        usual = max(float(relative[: len(self.points)].nan_to_num().median()), torch.finfo(y.dtype).tiny)
+        slowness, claim = usual / relative[away], "no equilibrium but the attractor"
+        return self._judge(claim, slowness, 1e10, "largest slowness", every[away])
 
     def _positive(self) -> Line:
         """A V that is flat, or that jumps at the attractor, proves nothing, whatever its slope."""

@@ -509,6 +509,20 @@ class CannotSay(Straight):
         raise Mute
 
 
+class EndsInSaying(Straight):
+    def _learn(self, shown, progress):
+        class Leaves(Exception):
+            def __str__(self):
+                raise SystemExit
+
+        raise Leaves
+
+
+class RaisesItsOwn(Straight):
+    def _learn(self, shown, progress):
+        raise type("OutOfBudget", (BaseException,), {})("spent")
+
+
 class SaysWhatNoFileHolds(Straight):
     def _learn(self, shown, progress):
         raise OSError(os.fsdecode(b"caf\xe9"))
@@ -536,7 +550,7 @@ class HoldsASparseTensor(Straight):
 @pytest.mark.parametrize("stored", [False, True])
 @pytest.mark.parametrize(
     ("method", "status"),
-    [(bad, "failed") for bad in (Exits, Generates, CannotSay, SaysWhatNoFileHolds)]
+    [(bad, "failed") for bad in (Exits, Generates, CannotSay, EndsInSaying, RaisesItsOwn, SaysWhatNoFileHolds)]
     + [(odd, "ok") for odd in (ReportsFloat32, HoldsBfloat16, HoldsASparseTensor)],
 )
 def test_one_bad_method_does_not_end_a_comparison(method, status, stored, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 import math
@@ -235,7 +236,7 @@ BROKEN = {
     Ages: "a motion is its two halves",
     Rises: "V falls along motions",
     Stalls: "every motion arrives within 100 durations",
-    DividesByZero: "velocities are finite",
+    DividesByZero: "parameters and velocities are finite",
     RunsBackwards: "latent motions approach",
 }
 ALONE = {RestsElsewhereTangentially, HasAWrongJacobian, EncodesWrongly, Jumps, Rises, Stalls}
@@ -620,6 +621,42 @@ def test_a_system_whose_motions_raise_is_falsified_and_says_what():
     assert "RuntimeError: out of order" in str(line)
 
 
+class Creeps(StandsStillOnALine):
+    """So slow that it is nowhere near when the demonstration ends, and nowhere at rest."""
+
+    def _learn(self, shown, progress):
+        with torch.no_grad():
+            self.attractor.copy_(shown[0].goal)
+        return Learned(0.0)
+
+    def forward(self, y):
+        return 1e-13 * (self.attractor - y)
+
+    def lyapunov(self, y):
+        return (y - self.attractor).square().sum(-1)
+
+
+@pytest.mark.filterwarnings("ignore::latentds.FitWarning")
+def test_a_field_that_is_slow_everywhere_is_not_said_to_rest_somewhere():
+    certificate = certify(Creeps().fit(wavy_motion(2)), [[-1, -1], [1, 1]], n_samples=50)
+    broken = {line.claim for line in certificate.falsified}
+    assert "no equilibrium but the attractor" not in broken
+    assert {"every motion arrives within 100 durations", "follows its demonstration"} <= broken
+
+
+@pytest.mark.parametrize("method", ["TubeDS", "ChebyshevDS", "FDM", "SDSEF"])
+def test_no_number_that_is_none_hides_from_the_certificate(fitted, method):
+    """Wherever it stands: some velocities may not show it, such as beyond the last knot of a law."""
+    for number in (math.nan, math.inf):
+        for name in fitted(method, 2).state_dict():
+            ds = copy.deepcopy(fitted(method, 2))
+            ds.state_dict()[name].view(-1)[-1].fill_(number)
+            certificate = certify(ds, n_samples=20)
+            assert certificate.falsified[0].claim == "parameters and velocities are finite", name
+            with pytest.raises(ValueError, match=r"^ds: expected finite parameters"):
+                ds.controller()
+
+
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", ["centers", "log_widths", "strengths"])
 def test_a_parameter_that_is_no_number_is_nowhere_left_out(name, number, tmp_path):
@@ -633,7 +670,7 @@ def test_a_parameter_that_is_no_number_is_nowhere_left_out(name, number, tmp_pat
     with reference():
         assert bool(torch.isnan(ds(y)).all())
     certificate = certify(ds, n_samples=50)
-    assert certificate.falsified[0].claim == "velocities are finite"
+    assert certificate.falsified[0].claim == "parameters and velocities are finite"
     assert not [line for line in certificate.lines if line.verdict == "proven"]
     with pytest.raises(ValueError, match=r"^ds: expected finite parameters"):
         ds.controller()
