@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import itertools
 import re
+import subprocess
+import sys
 import time
 import warnings
 from dataclasses import replace
@@ -84,3 +86,19 @@ def test_neither_a_clock_nor_threads_change_a_fit(monkeypatch):
         torch.set_num_threads(threads)
     assert states[0].keys() == states[1].keys()
     assert all(torch.equal(value, states[1][name]) for name, value in states[0].items())
+
+
+@pytest.mark.slow
+def test_seven_busy_processes_change_no_fit():
+    def fitted():
+        return TubeDS(2, n_layers=40).fit(planar_spiral(1.5, 300)).state_dict()
+
+    alone = fitted()
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(7)]
+    try:
+        beside = fitted()
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+    assert all(torch.equal(value, beside[name]) for name, value in alone.items())
