@@ -153,6 +153,7 @@ class Demonstration:
         time: str | int | None = None,
         unit: str | None = None,
         dt: float | None = None,
+        episode: str | int | None = None,
         name: str | None = None,
     ) -> Demonstration:
         """Read a recording: what :meth:`save` wrote, or a file of your own.
@@ -164,11 +165,12 @@ class Demonstration:
 
         Args:
             path: the file.
-            columns: the positions: a name (of a column, or of an array with all its columns), a column's number from
-                0, or several.
+            columns: the positions: a name (of a column, of an array with all its columns, or of all that begin with it
+                and a slash), a column's number from 0, or several.
             time: the column of time stamps. Uneven ones are resampled as :meth:`from_times` does.
             unit: of the time stamps: "s", "ms", "us" or "ns".
             dt: seconds between two rows; time stamps are then not looked at.
+            episode: which motion, by its label or number, if there are several; :meth:`load_all` takes them all.
             name: a label; the one in the file, or the file's name, by default.
 
         Raises:
@@ -180,8 +182,28 @@ class Demonstration:
         if name is None:
             saved = table.get("name", np.array(0))
             name = str(saved) if saved.ndim == 0 and saved.dtype.kind == "U" else path.stem
-        motion = recordings.interpret(table, path.name, columns=columns, time=time, unit=unit, dt=dt)
-        return cls._of(motion, name)
+            name += "" if episode is None else f"[{episode}]"
+        return cls._of(recordings.interpret(table, path.name, recordings.Asked(columns, time, unit, dt), episode), name)
+
+    @classmethod
+    def load_all(
+        cls,
+        path: str | os.PathLike[str],
+        *,
+        columns: str | int | Sequence[str | int] | None = None,
+        time: str | int | None = None,
+        unit: str | None = None,
+        dt: float | None = None,
+    ) -> list[Demonstration]:
+        """Every motion of a file, in its order: a single one, or several that are told apart.
+
+        By a column that numbers them (episode_index, say), by numbers in the names of arrays (data/0, data/1, …), by
+        the first axis of an array (K, N, n), or by a time that starts over. The arguments are those of :meth:`load`.
+        """
+        path = Path(path)
+        asked = recordings.Asked(columns, time, unit, dt)
+        motions = recordings.interpret_all(recordings.read_table(path), path.name, asked)
+        return [cls._of(motion, f"{path.stem}[{which}]" if which else path.stem) for which, motion in motions.items()]
 
     @classmethod
     def from_table(
@@ -192,12 +214,12 @@ class Demonstration:
         time: str | int | None = None,
         unit: str | None = None,
         dt: float | None = None,
+        episode: str | int | None = None,
         name: str = "",
     ) -> Demonstration:
         """What :meth:`load` does, for a pandas frame or a mapping from names to arrays that is at hand already."""
-        known = recordings.as_table(table)
-        motion = recordings.interpret(known, name or "the table", columns=columns, time=time, unit=unit, dt=dt)
-        return cls._of(motion, name)
+        asked = recordings.Asked(columns, time, unit, dt)
+        return cls._of(recordings.interpret(recordings.as_table(table), name or "the table", asked, episode), name)
 
     @classmethod
     def _of(cls, motion: recordings.Motion, name: str) -> Demonstration:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import itertools
 import re
 from collections import Counter
@@ -14,8 +15,9 @@ from numpy.typing import NDArray
 
 from ..arguments import Array, positive
 from . import vocabulary
+from .episodes import split
 from .readers import Table, counts_rows
-from .vocabulary import POSITION_KINDS, UNITS, has_word, is_step, kind_of
+from .vocabulary import POSITION_KINDS, UNITS, has_word, is_step, kind_of, kinds_of
 
 Names = str | int | Sequence[str | int]
 """Of a column, or of an array with all its columns, or a column's number from 0; or several."""
@@ -25,6 +27,14 @@ EVERYDAY_DURATION = (0.05, 3600.0)
 """Seconds that such a recording takes."""
 EVERYDAY_DATE = (9e8, 4e9)
 """Seconds since 1970 of the years 1998 to 2096."""
+INDEX_NAME = re.compile(r"column 0|Unnamed: 0|index|level_0|")
+"""What the index of a data frame is called in a file that it was written to."""
+MOST_REPEATED = 0.05
+"""Share of rows with the time of the row before that are left out; more of them are a clock that is too coarse."""
+GAP = 10.0
+"""A step of so many usual ones is told as a gap in the recording."""
+LYING = 10
+"""Rows and columns of an array without time: so many times as many columns as rows, and it is transposed."""
 ASK_ABOVE_COLUMNS = 200
 """Positions of more columns are asked about."""
 EVEN_WITHIN = 0.2
@@ -71,16 +81,47 @@ class _Timing(NamedTuple):
     dt: float | None = None
 
 
-def interpret(
-    table: Table, label: str, *, columns: Names | None, time: str | int | None, unit: str | None, dt: float | None
-) -> Motion:
-    """Tell time and positions in a table from names and numbers, or ask.
+class Asked(NamedTuple):
+    """The arguments of :meth:`~latentds.Demonstration.load`."""
 
-    ``label`` is what messages call it; the others are the arguments of :meth:`~latentds.Demonstration.load`.
+    columns: Names | None
+    time: str | int | None
+    unit: str | None
+    dt: float | None
+
+
+def interpret(table: Table, label: str, asked: Asked, episode: str | int | None) -> Motion:
+    """Tell time and positions of one motion in a table from names and numbers, or ask.
+
+    ``label`` is what messages call it.
 
     Raises:
         ValueError: if it is ambiguous, names the argument that settles it and says what was seen.
     """
+    how, parts = split(table)
+    if episode is None and parts and asked.columns is None:
+        raise ValueError(
+            f"episode: expected one motion, got {len(parts)} in {label}, by {how}: {_shortened(list(parts))}; "
+            "pass episode=, or take all of them with Demonstration.load_all"
+        )
+    if episode is not None:
+        if str(episode) not in parts:
+            known = f"one of {_shortened(list(parts))}" if parts else f"none, since {label} holds one motion"
+            raise ValueError(f"episode: expected {known}, got {episode!r}")
+        table, label = parts[str(episode)], f"{label}[{episode}]"
+    return _one(table, label, asked)
+
+
+def interpret_all(table: Table, label: str, asked: Asked) -> dict[str, Motion]:
+    """Each motion in a table by its label, "" if there is but one."""
+    _, parts = split(table)
+    if not parts:
+        return {"": _one(table, label, asked)}
+    return {name: _one(part, f"{label}[{name}]", asked) for name, part in parts.items()}
+
+
+def _one(table: Table, label: str, asked: Asked) -> Motion:
+    columns, time, unit, dt = asked
     if unit is not None and not (isinstance(unit, str) and unit in vocabulary.UNIT_WORDS):
         raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
     if dt is not None:
@@ -107,10 +148,12 @@ class _Interpretation:
         self.arrays = {name: a for name, a in numbers.items() if 1 <= a.ndim <= 2 and a.size}
         counts = {len(a) for name, a in self.arrays.items() if a.ndim == 1 and _is_clock(name, a)}
         for name, array in self.arrays.items():
-            if array.ndim == 2 and array.shape[1] in counts and len(array) not in counts:
+            fits = array.ndim == 2 and (array.shape[1] in counts or (not counts and _lies(array)))
+            if fits and len(array) not in counts:
                 self.arrays[name] = array.T
-                self.remarks.append(f"{name} transposed to (N, n)")
-        self.columns = [column for name in self.arrays for column in self._columns_of(name)]
+                self.remarks.append(f"{name or 'the array'} transposed to (N, n)")
+        kinds = zip(self.arrays, kinds_of(list(self.arrays)), strict=True)
+        self.columns = [column for name, kind in kinds for column in self._columns_of(name, kind)]
 
     def motion(self, columns: Names | None, time: str | int | None, dt: float | None) -> Motion:
         clock = [] if time is None else self._named([time], "time")
@@ -134,6 +177,8 @@ class _Interpretation:
         elif any(self.arrays[c.block].ndim == 2 and count < self.arrays[c.block].shape[1] for c in chosen):
             self._ask_about_shape([c for c in self.columns if c.block == chosen[0].block], count)
         positions = np.stack([c.values for c in chosen], axis=1)
+        if timing.times is not None:
+            positions, timing = self._once_a_stamp(positions, timing)
         if columns is None and all(c.kind == "unknown" for c in chosen):
             self._ask_about_derivatives(chosen, positions, timing)
         used = {c.name for c in chosen} | set(timing.columns)
@@ -148,8 +193,10 @@ class _Interpretation:
 
     # Columns -------------------------------------------------------------------------------------------------------
 
-    def _columns_of(self, block: str) -> list[_Column]:
-        array, kind, dated = self.arrays[block], kind_of(block), None
+    def _columns_of(self, block: str, kind: str) -> list[_Column]:
+        array, dated = self.arrays[block], None
+        if array.ndim == 1 and INDEX_NAME.fullmatch(block) and counts_rows(array):
+            kind = "other"  # a data frame's index, written with it
         if array.dtype.kind in "Mm":
             array, kind, dated = (array - array[0]) / np.timedelta64(1, "ns") * 1e-9, "time", "s"
         labels = names = [block]
@@ -178,10 +225,13 @@ class _Interpretation:
         columns: list[_Column] = []
         for name in wanted:
             match = [c for c in self.columns if c.name == name] or [c for c in self.columns if c.block == name]
+            match = match or [c for c in self.columns if c.name.startswith(f"{name}/")]
             if isinstance(name, (int, np.integer)) and not isinstance(name, bool) and name >= 0:
                 match = self.columns[name : name + 1]
             if not match:
-                self._ask(argument, f"expected names or numbers of columns, got {name!r}")
+                near = difflib.get_close_matches(str(name), [*self.arrays, *(c.name for c in self.columns)], 1)
+                meant = f", perhaps {near[0]!r}" if near else ""
+                self._ask(argument, f"expected names or numbers of columns{meant}, got {name!r}")
             columns += match
         return columns
 
@@ -192,9 +242,19 @@ class _Interpretation:
             if text.ndim == 1 and len(text) > 2 and kind in POSITION_KINDS:
                 raise ValueError(f"path: {self.label} is not a table of numbers ({str(text[0])!r} in column {name!r})")
         named = [c for c in columns if c.kind in POSITION_KINDS]
-        positions = named or [c for c in columns if c.kind == "unknown"]
+        unknown = [c for c in columns if c.kind == "unknown"]
+        positions = named or unknown
         if not positions:
-            self._ask("columns", "expected columns of positions")
+            self._ask("columns", f"expected columns of positions, got {', '.join(_by_kind(columns)) or 'none'}")
+        count = len(positions[0].values)
+        left = [c for c in columns if c.kind not in (*POSITION_KINDS, "time", "other") and len(c.values) == count]
+        doubtful = [c for c in left if c.kind == "unknown" and _may_move(c.values)] if named else []
+        if doubtful and not self.ours:
+            self._ask(
+                "columns", f"expected to know whether {_listed(doubtful)} belong to the positions {_listed(named)}"
+            )
+        if named and left and all(c.kind == "orientation" for c in named):
+            self._ask("columns", f"expected positions beside the orientation {_listed(named)}")
         self._ask_about_sets(positions)
         quantities = Counter(vocabulary.quantity_of(c.name) for c in named)
         twice = [quantity for quantity, times in quantities.items() if times > 1]
@@ -228,7 +288,8 @@ class _Interpretation:
         """
         taken = {id(c) for c in chosen}
         others = [c for c in self.columns if id(c) not in taken and len(c.values) == count]
-        pool = others if not free else chosen if len(chosen) > 1 else []
+        unknown = [c for c in others if c.kind == "unknown" and c.kind != chosen[0].kind]
+        pool = others if not free else [*(chosen if len(chosen) > 1 else []), *unknown]
         rising = [c for c in pool if c.kind == "unknown" and _is_even(c.values)]
         unnamed = [c for c in rising if free and self.arrays[c.block].ndim == 2]
         if dt is not None:
@@ -253,6 +314,9 @@ class _Interpretation:
         if rising:
             seen = _listed(rising)
             self._ask("time", f"expected one column that rises evenly, got {seen}; if none is time, pass dt=")
+        for name, text in self.texts.items():
+            if vocabulary.is_time(name) and text.ndim == 1 and len(text):
+                self._ask("dt", f"expected numbers or dates as the time, got text such as {str(text[0])!r} in {name!r}")
         self._ask("dt", "expected the seconds between two rows, which nothing here tells (or time=, a column)")
 
     def _row_numbers(self, rising: list[_Column]) -> tuple[str, ...]:
@@ -267,6 +331,21 @@ class _Interpretation:
         self.remarks.append(f"column {name} counts rows")
         return (name,)
 
+    def _once_a_stamp(self, positions: Array, timing: _Timing) -> tuple[Array, _Timing]:
+        """Without rows whose stamp is that of the row before; gaps are told."""
+        times: Any = timing.times
+        steps = np.diff(times)
+        kept = np.append(True, steps > 0)
+        again = np.flatnonzero(~kept)
+        if len(again):
+            rows = f"{len(again)} row{'s' * (len(again) > 1)} with the time of the row before"
+            self.remarks.append(f"left out {rows}, such as row {again[0]}")
+        usual = float(np.median(steps[steps > 0]))
+        for row in np.flatnonzero(steps > GAP * usual)[:3]:
+            longer = f"{steps[row] / usual:.0f} times the usual step"
+            self.remarks.append(f"a gap of {steps[row]:.3g} s after row {row}, {longer}, is bridged by a straight line")
+        return positions[kept], timing._replace(times=times[kept])
+
     def _named_stamps(self, count: int, taken: set[str]) -> list[_Column]:
         stamps = [c for c in self.columns if c.kind == "time" and len(c.values) == count and c.name not in taken]
         for whole in [s for s in stamps if s.unit == "s"]:
@@ -279,7 +358,7 @@ class _Interpretation:
         return stamps
 
     def _one_of(self, named: list[_Column]) -> _Column:
-        named = [s for s in named if (np.diff(s.values) > 0).all()] or named[:1]
+        named = [s for s in named if (np.diff(s.values) >= 0).all()] or named[:1]
         named = [s for s in named if not counts_rows(s.values)] or named
         if len(named) > 1:
             durations = [(s.values[-1] - s.values[0]) * UNITS[self._unit(s)] for s in named]
@@ -293,8 +372,9 @@ class _Interpretation:
         if not np.isfinite(values).all():
             row = int(np.argmin(np.isfinite(values)))
             raise ValueError(f"time: expected finite numbers in column {name!r} of {self.label}, got none in row {row}")
-        if not (np.diff(values) > 0).all():
-            row = int(np.argmin(np.diff(values) > 0))
+        steps = np.diff(values)
+        if (steps < 0).any() or (steps == 0).mean() > MOST_REPEATED:
+            row = int(np.argmin(steps))
             raise ValueError(
                 f"times: expected strictly increasing, got {values[row]:.15g} then {values[row + 1]:.15g} "
                 f"at row {row} of {name!r} in {self.label}; pass time= or dt="
@@ -309,7 +389,8 @@ class _Interpretation:
         if self.unit is not None:
             return self.unit
         values = stamps.values
-        step, duration = float(np.median(np.diff(values))), float(values[-1] - values[0])
+        steps = np.diff(values)
+        step, duration = float(np.median(steps[steps > 0])), float(values[-1] - values[0])
         possible = [u for u, seconds in UNITS.items() if _is_everyday(step * seconds, duration * seconds)]
         if stamps.unit in possible or self.ours:
             return stamps.unit or "s"
@@ -408,6 +489,16 @@ class _Interpretation:
 
 def _is_clock(name: str, array: NDArray[Any]) -> bool:
     return array.dtype.kind in "Mm" or (array.dtype.kind != "U" and vocabulary.is_time(name))
+
+
+def _lies(array: NDArray[Any]) -> bool:
+    """Whether an array (n, N) lies, as MATLAB's users keep motions: few rows, and far more columns."""
+    return bool(array.shape[0] <= LYING and array.shape[1] >= LYING * array.shape[0] and array.shape[1] > 30)
+
+
+def _may_move(values: Array) -> bool:
+    """Whether a column can be a coordinate: it is neither constant nor counts rows, nor rises as time does."""
+    return bool((values != values[0]).any()) and not counts_rows(values) and not _is_even(values)
 
 
 def _squeezed(array: NDArray[Any]) -> NDArray[Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Set
+from collections.abc import Sequence, Set
 
 
 def _vocabulary(words: str) -> frozenset[str]:
@@ -23,7 +23,7 @@ UNIT_WORDS = {
     for word in words.split()
 }
 TIME_WORDS = _vocabulary(
-    "time times timestamp timestamps stamp stamps elapsed clock zeit rosbagtimestamp datetime date"
+    "time times timestamp timestamps stamp stamps ts elapsed clock zeit rosbagtimestamp datetime date"
 )
 STEP_NAMES = _vocabulary(
     "dt delta_t delta_time time_delta time_step timestep period sample_time sample_period sampling_time sampling_period"
@@ -33,7 +33,8 @@ RATE_WORDS = _vocabulary("fs fps hz rate frequency freq")
 KINDS = {
     "other": _vocabulary(
         "error err errors std var variance cov covariance temperature temperatures temp voltage status mode id seq "
-        "index idx frame frames row rows sample samples count counter"
+        "index idx frame frames row rows sample samples count counter reward rewards done success terminal marker "
+        "markers gripper grippers episode episodes"
     ),
     "acceleration": _vocabulary(
         "acceleration accelerations acc accel qdd ddq qddot qacc ddx ddy ddz xdd ax ay az ddot"
@@ -43,13 +44,23 @@ KINDS = {
         "omega twist dtheta thetadot"
     ),
     "effort": _vocabulary("effort efforts torque torques tau force forces fx fy fz mx my mz current currents wrench"),
-    "command": _vocabulary("desired target targets command commands commanded cmd ref reference setpoint"),
+    "command": _vocabulary(
+        "desired target targets command commands commanded cmd ref reference setpoint action actions"
+    ),
     "joint": _vocabulary("q joint joints angle angles theta qpos j encoder"),
-    "orientation": _vocabulary("qx qy qz qw w quat quaternion orientation rotation rpy roll pitch yaw rx ry rz euler"),
-    "Cartesian": _vocabulary("x y z px py pz xyz pose tcp ee cartesian"),
+    "orientation": _vocabulary("qx qy qz qw quat quaternion orientation rotation rpy rx ry rz euler"),
+    "Cartesian": _vocabulary("x y z px py pz tx ty tz xyz pose tcp ee cartesian"),
     "position": _vocabulary("position positions pos"),
 }
 """Kinds of columns and the words that tell them; the first kind that fits is taken."""
+SIBLINGS = [
+    (_vocabulary("roll pitch yaw"), _vocabulary("roll pitch yaw x y z"), 2),
+    (_vocabulary("phi theta psi"), _vocabulary("phi theta psi x y z"), 2),
+    (_vocabulary("w x y z"), _vocabulary("w x y z"), 4),
+]
+"""Words that tell an orientation only beside so many of a set: a wrist_roll alone is a joint like its neighbours."""
+EPISODE_WORDS = _vocabulary("episode episodes demo demos trial trials trajectory trajectories rollout")
+"""Of a column that numbers several motions in one table."""
 POSITION_KINDS = ("joint", "orientation", "Cartesian", "position")
 LABEL_WORDS = _vocabulary("name names joints columns labels")
 """Of a list that names the columns of an array beside it."""
@@ -59,7 +70,8 @@ SOURCE_WORDS = _vocabulary("actual measured filtered raw smoothed meas msr")
 
 def words_of(name: str) -> list[str]:
     """A name in small letters, split at whatever is no letter or digit, between the two, and before capitals."""
-    return re.findall(r"[^\W\d_]+|\d+", re.sub(r"([a-zà-ÿ])([A-Z])", r"\1 \2", name).lower())
+    parts = re.findall(r"[^\W\d_]+|\d+", re.sub(r"([a-zà-ÿ])([A-Z])", r"\1 \2", name).lower())
+    return re.sub(r"\b(milli|micro|nano) (?=s(ec(ond)?s?)?\b)", r"\1", " ".join(parts)).split()
 
 
 def kind_of(name: str) -> str:
@@ -73,7 +85,32 @@ def kind_of(name: str) -> str:
         return "unknown"  # beside u, say
     if words[:2] == ["q", "d"]:
         return "command"  # q_d, the desired posture; qd is a velocity
+    if "twist" in words[1:] and not {"linear", "angular", "x", "y", "z"} & set(words):
+        return kind_of(" ".join(word for word in words if word != "twist"))  # of a forearm, and no velocity
     return next((kind for kind, known in KINDS.items() if known & set(words)), "unknown")
+
+
+def kinds_of(names: Sequence[str]) -> list[str]:
+    """What names say of their columns beside each other.
+
+    Roll, pitch and yaw, φ, θ and ψ, and a quaternion's w are told by others of their set. A "current" before a position
+    is the present one, unless the position is there without it.
+    """
+    words = [words_of(name) for name in names]
+    kinds = [kind_of(name) for name in names]
+    for i, mine in enumerate(words):
+        for own, known, enough in SIBLINGS:
+            for k in [k for k, word in enumerate(mine) if word in own][-1:]:
+                alike = [other for other in words if other[:k] == mine[:k] and other[k + 1 :] == mine[k + 1 :]]
+                if len(known & {other[k] for other in alike if len(other) > k}) >= enough:
+                    kinds[i] = "orientation"
+        if (
+            mine[:1] == ["current"]
+            and mine[1:] not in words
+            and (kind := kind_of(" ".join(mine[1:]))) in POSITION_KINDS
+        ):
+            kinds[i] = kind
+    return kinds
 
 
 def is_time(name: str) -> bool:

@@ -75,16 +75,16 @@ REFUSED = {
     "time with a gap": ("a.csv", text(XYZ, ["0.0", "", *map(str, T[2:])], Q), "time: .*row 1"),
     "joints and hand": ("a.csv", text("t,q1,q2,q3,x,y,z", T1, Q, Q + 1), "columns: .*pass columns="),
     "two arms": ("a.npz", archive(left=Q, right=Q, t=T), "columns: .*left 60×3, right 60×3"),
-    "several motions": ("a.npz", archive(q_0=Q, q_1=Q[5:], dt=DT), "columns: .*q_0 60×3, q_1 55×3"),
+    "several motions": ("a.npz", archive(q_0=Q, q_1=Q[5:], dt=DT), "episode: .*by names .*: q_0, q_1; pass"),
     "raw and filtered": ("a.csv", text("t,raw_x,raw_y,filtered_x,filtered_y", T1, Q[:, :2], Q[:, :2]),
                          "columns: .*'x'"),
     "names twice": ("a.csv", text("t,x,y,x,y", T1, Q[:, :2], Q[:, :2]), "columns: .*several"),
     "velocities without names": ("a.csv", text("", T1, Q, V), "columns: .*velocities of 1, 2, 3"),
     "and efforts": ("a.npy", lambda p: np.save(p, np.column_stack([T, Q, V, TAU])), "columns: .*velocities of 1, 2, 3"),
     "velocities alone": ("a.csv", text("t,dq1,dq2,dq3", T1, V), "columns: "),
-    "(n, N)": ("a.npy", lambda p: np.save(p, Q.T), "dt: |columns: .*transposed"),
+    "(n, N)": ("a.npy", lambda p: np.save(p, Q.T), "dt: "),
     "1000 columns": ("a.npz", archive(data=np.tile(Q, (20, 400)), dt=DT), "columns: .*at most 200"),
-    "three axes": ("a.npz", archive(q=np.stack([Q, Q]), dt=DT), "columns: .*q 2×60×3"),
+    "three axes": ("a.npz", archive(q=np.stack([Q, Q]), dt=DT), "episode: .*first axis of q: 0, 1;.*load_all"),
     "a lost marker": ("a.csv", lambda p: p.write_text("t,x\n0,1\n0.1,\n0.2,3\n"), "positions: .*NaN.* row 1"),
     "names that change": ("a.csv", text("t;name;position", T1, ["['a', 'b', 'c']"] * (N - 1) + ["['b', 'a', 'c']"],
                                         lists(Q), sep=";"), "columns: .*'name'"),
@@ -119,6 +119,9 @@ def test_asks_about_what_is_ambiguous(kind, tmp_path):
         ("joints and hand", {"columns": ["q1", "q2", "q3"]}),
         ("two arms", {"columns": "left"}),
         ("several motions", {"columns": "q_0"}),
+        ("several motions", {"episode": "q_0"}),
+        ("three axes", {"episode": 1}),
+        ("(n, N)", {"dt": DT}),
         ("raw and filtered", {"columns": ["raw_x", "raw_y"], "of": [0, 1]}),
         ("names twice", {"columns": (1, 2), "of": [0, 1]}),
         ("velocities without names", {"columns": range(1, 4)}),
@@ -164,3 +167,64 @@ def test_uneven_stamps_are_resampled(tmp_path):
     shown = Demonstration.load(tmp_path / "a.csv")
     wanted = Demonstration.from_times(uneven, Q)
     np.testing.assert_allclose(shown.positions, wanted.positions, atol=1e-6)
+
+
+def test_every_motion_of_a_file_is_read_and_named(tmp_path):
+    """By a column, by names, by an axis, and by a time that starts over; each with the numbers of its own."""
+    twice, time = np.concatenate([Q, Q[5:]]), np.concatenate([T, T[5:] + 100])
+    numbers = np.repeat([3, 7], [N, N - 5])
+    head = [f"{t:.9f}" for t in time]
+    text("t,x,y,z,episode_index", head, twice, [str(i) for i in numbers])(tmp_path / "column.csv")
+    text("t,x,y,z", [f"{t:.9f}" for t in np.concatenate([T, T[5:]])], twice)(tmp_path / "time.csv")
+    np.savez(tmp_path / "names.npz", **{"demo_3/q": Q, "demo_3/t": T, "demo_7/q": Q[5:], "demo_7/t": T[5:]})
+    np.savez(tmp_path / "axis.npz", q=np.stack([Q, Q + 1]), t=T)
+    for name, labels in {
+        "column.csv": "37",
+        "time.csv": "01",
+        "names.npz": ["demo_3", "demo_7"],
+        "axis.npz": "01",
+    }.items():
+        stem, (first, second) = name.partition(".")[0], Demonstration.load_all(tmp_path / name)
+        assert [first.name, second.name] == [f"{stem}[{label}]" for label in labels]
+        np.testing.assert_allclose(first.positions, Q, atol=2e-5)
+        np.testing.assert_allclose(second.positions, Q + 1 if name == "axis.npz" else Q[5:], atol=2e-5)
+        assert second.origin.startswith(f"{name}[{labels[1]}]: ")
+        with pytest.raises(ValueError, match=rf"^episode: expected one motion, got 2 in {name}"):
+            Demonstration.load(tmp_path / name)
+        with pytest.raises(ValueError, match=rf"^episode: expected one of {labels[0]}, {labels[1]}, got 9"):
+            Demonstration.load(tmp_path / name, episode=9)
+        one = Demonstration.load(tmp_path / name, episode=labels[1])
+        assert one.fingerprint == second.fingerprint
+    (alone,) = Demonstration.load_all(tmp_path / "axis.npz", columns="q")[:1]
+    assert alone.dim == 3
+
+
+def test_no_number_is_left_out_without_a_word(tmp_path):
+    """Beside what is known to be positions, what nothing tells is asked about; what does not move is not."""
+    text("t,x,y,z,grasp", T1, Q, Q[:, :1])(tmp_path / "a.csv")
+    with pytest.raises(ValueError, match=r"^columns: expected to know whether grasp belong to the positions x, y, z"):
+        Demonstration.load(tmp_path / "a.csv")
+    assert Demonstration.load(tmp_path / "a.csv", columns=["x", "y", "z"]).dim == 3
+    text("t,x,y,z,grasp,k", T1, Q, np.ones((N, 1)), [str(i) for i in range(N)])(tmp_path / "b.csv")
+    shown = Demonstration.load(tmp_path / "b.csv")
+    assert shown.dim == 3
+    assert "left out grasp, k" in shown.origin
+    text("t,qx,qy,qz,qw,dx", T1, Q, Q[:, :2])(tmp_path / "c.csv")
+    with pytest.raises(ValueError, match=r"^columns: expected positions beside the orientation qx, qy, qz, qw"):
+        Demonstration.load(tmp_path / "c.csv")
+
+
+def test_a_stamp_that_repeats_and_a_gap_are_told(tmp_path):
+    times = np.concatenate([T[:20], T[19:30], T[30:] + 3.0])
+    text(XYZ, times[:, None], np.concatenate([Q[:20], Q[19:]]))(tmp_path / "a.csv")
+    shown = Demonstration.load(tmp_path / "a.csv")
+    assert len(shown) == N
+    assert "left out 1 row with the time of the row before, such as row 20" in shown.origin
+    assert "a gap of 3.02 s after row 30, 151 times the usual step, is bridged by a straight line" in shown.origin
+
+
+def test_names_that_begin_alike_are_taken_together_and_a_near_name_is_suggested(tmp_path):
+    np.savez(tmp_path / "a.npz", t=T, **{f"hand/position/{c}": Q[:, i] for i, c in enumerate("xyz")})
+    assert Demonstration.load(tmp_path / "a.npz", columns="hand/position").dim == 3
+    with pytest.raises(ValueError, match=r"^columns: .*, perhaps 'hand/position/x', got 'hand/positon/x'"):
+        Demonstration.load(tmp_path / "a.npz", columns="hand/positon/x")
