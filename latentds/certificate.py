@@ -322,10 +322,13 @@ class _Search:
 
     def _positive(self) -> Line:
         """A V that is flat, or that jumps at the attractor, proves nothing, whatever its slope."""
-        distance = max(1e-7 * self.size, 8 * torch.finfo(self.goal.dtype).eps * float(self.goal.abs().max()))
-        beside = self.goal + distance * self._directions(64).to(self.goal)
+        least = 8 * torch.finfo(self.goal.dtype).eps * float(self.goal.abs().max())
+        distances = torch.tensor([max(share * self.size, least) for share in (1e-7, 1e-10, 1e-13)]).to(self.goal)
+        rings = self.goal + distances.view(-1, 1, 1) * self._directions(64).to(self.goal)
         with torch.no_grad():
             high = self.ds.lyapunov(self.points)
+            around = self.ds.lyapunov(rings).abs()
+            beside = rings[around.amax(-1).argmin()]  # V may be steep, and need not be low on each of them
             low = self.ds.lyapunov(torch.cat([self.goal.unsqueeze(0), beside])).abs() / high.max()
         badness = torch.cat([torch.where(high > 0, 0.0, math.inf), low])
         points = torch.cat([self.points, self.goal.unsqueeze(0), beside])

@@ -221,9 +221,13 @@ def test_the_fuzzer_tells_what_is_not_said_of_tampering(followed, monkeypatch):
 def test_the_fuzzer_tells_a_number_that_is_left_out(followed, monkeypatch):
     monkeypatch.setattr(StableDS, "save", lambda ds, path: None)
     assert tampered("nan in it", followed).startswith("a controller or a file with nan in ")
-    monkeypatch.setattr(FDM, "forward", lambda ds, y: torch.ones_like(y) * (1 + ds.dynamics.law.speeds.isnan().any()))
-    monkeypatch.setattr(FDM, "state_dict", lambda ds: {"speeds": ds.dynamics.law.speeds}, raising=False)
-    assert tampered("nan in it", followed) == "velocities of another system with nan in speeds"
+    name, centers = "diffeomorphism.centers", followed.diffeomorphism.centers
+    monkeypatch.setattr(
+        FDM, "forward", lambda ds, y: torch.ones_like(y) * (1 + ds.diffeomorphism.centers.isnan().any())
+    )
+    monkeypatch.setattr(FDM, "state_dict", lambda ds: {name: ds.diffeomorphism.centers}, raising=False)
+    assert tampered("nan in it", followed) == f"velocities of another system with nan in {name}"
+    assert not centers.isnan().any()
 
 
 @pytest.mark.parametrize(
