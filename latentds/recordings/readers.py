@@ -376,7 +376,7 @@ def _check_unpacked(data: bytes) -> None:
 
 def _check_size(size: int) -> None:
     if size > files.MAX_BYTES:
-        raise ValueError(f"holds more than {files.MAX_BYTES} bytes, unpacked")
+        raise ValueError(f"holds at least {size} bytes, more than {files.MAX_BYTES}")
 
 
 def _read_parquet(data: bytes) -> Table:
