@@ -30,9 +30,9 @@ FLIP_COSINE, UNIT_WITHIN = -0.5, 1e-3
 is below the first."""
 LEAST_ROWS = 12
 """Fewer rows say nothing of what a usual step is."""
-JUMP_TIMES, JUMP_SIZE, JUMP_RANGE = 8.0, 0.01, 0.2
+JUMP_TIMES, JUMP_SIZE, JUMP_RANGE, JUMP_LEAST = 8.0, 0.01, 0.2, 1e-3
 """A step is a jump if it is so many times the usual one, that of its neighbours and of its column, and if it is also so
-large in sizes, or in ranges of a column that has another unit."""
+large in sizes, or in ranges of a column that has another unit; below the last number of sizes a column rests."""
 GLITCH_ROWS, GLITCH_BACK = 5, 0.3
 """A jump that goes back within so many rows, but for so much of it, is a glitch."""
 GAP_TIMES, GAP_SHARE = 5.0, 0.01
@@ -369,7 +369,8 @@ def jumps(points: Array) -> list[Jump]:
     usual = np.maximum(_usual(steps), middle)
     ranges = np.ptp(points, axis=0)
     fine = moving.mean(0) > 0.5  # a column that rests but for a tick of its encoder does not jump
-    large = (steps > JUMP_SIZE * extent(points)) | (fine & (steps > JUMP_RANGE * ranges))
+    size = extent(points)
+    large = (steps > JUMP_SIZE * size) | (fine & (steps > np.maximum(JUMP_RANGE * ranges, JUMP_LEAST * size)))
     lone = large & (steps > JUMP_TIMES * usual)
     rows = np.flatnonzero(lone.any(1)).tolist()
     found, at = [], 0
