@@ -30,6 +30,7 @@ from .diffeomorphism import Diffeomorphism, eager_for_derivatives
 from .dynamics import Frame, LatentDynamics
 from .fidelity import EXCERPT_POINTS, ROUNDING_LIMIT, Excerpt, Fidelity, FitWarning, measure
 from .files import write_tensors
+from .findings import every_finding
 from .integrate import integrate
 from .kernels.dispatch import no_active_transforms
 from .kernels.private import is_altered, tensors_of
@@ -54,8 +55,8 @@ class FitReport:
         n_layers: layers of the diffeomorphism.
         seconds: wall time of the fit.
         history: loss per epoch, for methods that learn by gradient.
-        notes: what the user should know of this fit (early stop, divergence handled, choices made, what does not
-            follow the demonstration).
+        notes: what the user should know of this fit (early stop, divergence handled, choices made, what in the
+            demonstration would hurt it, what does not follow it).
         learned_from: name and SHA-256 of each demonstration.
         fidelity: how the fitted system follows what it was shown; None if a motion of it raised an error.
         columns: names of the coordinates, from the demonstrations; () if they have none.
@@ -173,15 +174,19 @@ class StableDS(nn.Module, ABC):
             ValueError: if this is no demonstration that the method can learn from.
 
         Warns:
-            FitWarning: if the system does not follow what it was shown, or may not follow a coordinate of another unit.
+            FitWarning: if the system does not follow what it was shown, or may not follow a coordinate of another unit,
+                or if something in what was shown (:mod:`latentds.findings`) hurts every fit.
         """
         shown = demonstrations_of(demonstration, self.dim)
         with _restored_on_failure(self):
             report = self._learn_and_measure(shown, bool(progress))
-            self.fit_report = report
             off = report.notes[-1:] if report.fidelity is None else report.fidelity.notes
+            follows = report.fidelity is not None and report.fidelity.follows
+            found, learned = every_finding(shown), report.notes[: len(report.notes) - len(off)]
+            new = tuple(one.text for one in found if not any(note in one.text for note in learned))
+            self.fit_report = replace(report, notes=(*learned, *new, *off))
+            off = (*off, *(one.text for one in found if one.certain or not follows))
             if off:
-                follows = report.fidelity is not None and report.fidelity.follows
                 verdict = "follows what it was shown, but" if follows else "does not follow what it was shown:"
                 warnings.warn(f"{type(self).__name__} {verdict} {'; '.join(off)}", FitWarning, stacklevel=2)
         return self

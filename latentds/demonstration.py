@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import logging
 import os
 from collections.abc import Sequence
@@ -12,10 +13,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.signal import savgol_filter
 from torch import Tensor
 
 from . import files, recordings
-from .arguments import Array, point_array, positive, real_array
+from . import findings as found
+from .arguments import Array, point_array, positive, real_array, whole_number
 from .curves import extent, interpolated
 
 logger = logging.getLogger(__name__)
@@ -244,6 +247,112 @@ class Demonstration:
                 columns = ["t [s]", *(f"y{i}" for i in range(self.dim))]
                 table = np.column_stack([self.times.numpy(), self.positions.numpy()])
                 np.savetxt(file, table, delimiter=",", header=",".join(columns), comments="", fmt="%.17g")
+
+    def check(self) -> found.Check:
+        """What in it would hurt a fit: each place, its size and the remedy; printed, a page to read."""
+        return found.Check(found.findings(self))
+
+    def unwrapped(self, columns: str | int | Sequence[str | int] | None = None) -> Demonstration:
+        """Without the jumps of angles that wrap by 2π or 360.
+
+        Args:
+            columns: names or numbers from 0; those that :meth:`check` finds to wrap, by default.
+        """
+        given = [columns] if isinstance(columns, (str, int)) else columns
+        wraps = found.wraps(self.positions.numpy())
+        chosen = list(wraps) if given is None else [self._column(column) for column in given]
+        periods = {column: wraps[column][0] if column in wraps else self._period(column) for column in chosen}
+        points = found.unwrapped(self.positions.numpy(), {at: found.PERIODS[by] for at, by in periods.items()})
+        named = [f"{self.columns[at] if self.columns else f'column {at}'} by {by}" for at, by in periods.items()]
+        return self._changed(points, f"unwrapped {', '.join(named)}")
+
+    def continuous(self) -> Demonstration:
+        """With every quaternion on one sign, q and -q being the same rotation."""
+        flips = found.flips(self.positions.numpy(), self.columns)
+        rows = sorted({row for each in flips.values() for row in each})
+        told = f"turned the sign of a quaternion at rows {', '.join(map(str, rows))}"
+        return self._changed(found.continuous(self.positions.numpy(), self.columns), told)
+
+    def deglitched(self) -> Demonstration:
+        """With a straight line in the place of lone glitches and of rows that repeat the one before."""
+        points = self.positions.numpy()
+        stale = [(first + 1, last) for first, last in found.repeats(points)]
+        mended = found.bridged(points, [(first - 1, last) for first, last in stale])
+        lone = [(one.first, one.last) for one in found.jumps(mended) if one.back]
+        rows = [row for first, last in sorted(stale + lone) for row in range(first, last + 1)]
+        mended = found.bridged(points, [(row - 1, row) for row in rows])
+        return self._changed(mended, f"interpolated rows {', '.join(map(str, rows))}")
+
+    def smoothed(self, seconds: float | None = None) -> Demonstration:
+        """Smoothed by cubics over a moving window (Savitzky-Golay); the first and the last point stay.
+
+        Args:
+            seconds: length of the window, at least four steps and at most the duration; a twentieth of it, or four
+                steps if that is more, by default.
+        """
+        least = min(4 * self.dt, self.duration)
+        asked = max(least, self.duration / 20) if seconds is None else positive(seconds, "seconds")
+        if not least * (1 - 1e-9) <= asked <= self.duration * (1 + 1e-9):
+            raise ValueError(f"seconds: expected {least:.3g} to {self.duration:.3g}, got {asked:.3g}")
+        half = max(1, min(round(asked / self.dt / 2), (len(self) - 1) // 2))
+        points = self.positions.numpy()
+        smooth = savgol_filter(points, 2 * half + 1, min(3, 2 * half), axis=0)
+        fade = np.maximum(0, 1 - np.arange(len(points)) / half)[:, None]
+        smooth += fade * (points[0] - smooth[0]) + fade[::-1] * (points[-1] - smooth[-1])
+        smooth[[0, -1]] = points[[0, -1]]
+        return self._changed(smooth, f"smoothed over {asked:.3g} s")
+
+    def trimmed(self) -> Demonstration:
+        """Without rests and swaying before and after the reach."""
+        first, last = found.reach(self.deglitched().positions.numpy())
+        return self._part(first, last + 1, f"trimmed to {first * self.dt:.3g} to {last * self.dt:.3g} s")
+
+    def resampled(self, n: int) -> Demonstration:
+        """As ``n`` >= 3 points, even in time."""
+        count = whole_number(n, "n", at_least=3)
+        even = self.at(np.linspace(0, self.duration, count))
+        told = self._changed(even, f"resampled from {len(self)} to {count} points")
+        return replace(told, dt=self.duration / (count - 1))
+
+    def split_at(self, rows: int | Sequence[int]) -> list[Demonstration]:
+        """In parts, each new one from one of ``rows`` on; at least three rows are in each."""
+        given = [rows] if isinstance(rows, (int, np.integer)) else list(rows)
+        edges = [0, *(whole_number(row, "rows", at_least=0) for row in given), len(self)]
+        if any(later - row < 3 for row, later in itertools.pairwise(edges)):
+            raise ValueError(f"rows: expected rising, 3 or more apart, of {len(self)} rows, got {rows!r}")
+        return [
+            self._part(row, later, f"rows {row} to {later - 1} of {len(self)}")
+            for row, later in itertools.pairwise(edges)
+        ]
+
+    def _part(self, first: int, behind: int, told: str) -> Demonstration:
+        return self._changed(self.positions.numpy()[first:behind], told)
+
+    def _changed(self, points: Array, told: str) -> Demonstration:
+        """With other points, and what was changed in ``origin``; itself if nothing was."""
+        if np.array_equal(points, self.positions.numpy()):
+            return self
+        return replace(
+            self, positions=torch.from_numpy(points.copy()), origin="; ".join(filter(None, [self.origin, told]))
+        )
+
+    def _column(self, column: str | int) -> int:
+        known: Sequence[str | int] = self.columns or range(self.dim)
+        if isinstance(column, str) and column in self.columns:
+            return self.columns.index(column)
+        if isinstance(column, (int, np.integer)) and not isinstance(column, bool) and 0 <= column < self.dim:
+            return int(column)
+        raise ValueError(f"columns: expected names or numbers among {list(known)}, got {column!r}")
+
+    def _period(self, column: int) -> str:
+        """What an angle wraps by that does not clearly do so: the period nearest to its largest step."""
+        step = float(np.abs(np.diff(self.positions.numpy()[:, column])).max())
+        name, value = min(found.PERIODS.items(), key=lambda pair: abs(np.log(max(step, 1e-300) / pair[1])))
+        if not value / 2 < step < 2 * value:
+            raise ValueError(
+                f"columns: expected a column with steps near 2π or 360, got {column}, by {step:.3g} at most"
+            )
+        return name
 
 
 def demonstrations_of(demonstration: Any, dim: int) -> list[Demonstration]:

@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 ROOMS = (
-    "arguments", "curves", "resizing", "tabulated", "memo", "files", "recordings", "demonstration",
+    "arguments", "curves", "resizing", "tabulated", "memo", "files", "recordings", "findings", "demonstration",
     "datasets", "time_law", "kernels", "diffeomorphism", "translations", "transform", "dynamics", "deploy",
     "integrate", "metrics", "probes", "fidelity", "fitting", "similarity", "base", "methods", "storage", "cache",
     "certificate", "testing", "cell", "benchmark", "plotting", "report", "cli", "__main__",

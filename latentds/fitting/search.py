@@ -17,9 +17,10 @@ import torch
 from torch import Tensor
 
 from ..arguments import Array
-from ..curves import extent, frame_along, interpolated, jitter, segment_distances, step_lengths
+from ..curves import extent, frame_along, interpolated, segment_distances, step_lengths
 from ..demonstration import Demonstration
 from ..fidelity import Excerpt, System, measure
+from ..findings import HIDDEN, what_hides
 from ..metrics import dtw
 from ..time_law import PiecewiseLinearLaw
 from ..translations import Layers
@@ -93,7 +94,7 @@ class Plan:
     steps: int = 300
     follows_below: float = 0.005
     note_above_miss: float = 0.01
-    hidden_above: float = 0.02
+    hidden_above: float = HIDDEN
     layer_budget: int = 40_000
 
 
@@ -340,7 +341,7 @@ class Search:
             fidelity = measure(trial(candidate), wanted)
             return max(fidelity.miss / plan.follows_below, *(bad for bad, _ in fidelity.findings))
 
-        hidden = _what_hides(shown, plan.hidden_above)
+        hidden = what_hides(shown.positions.numpy(), plan.hidden_above)
         best, least, dense = first, badness(first), crowded(fine, plan.crowded_points)
         again: list[tuple[float, Candidate]] = []
         laid, stopped = 0, False
@@ -396,21 +397,6 @@ class Search:
             yield from tracked("curvature", curvature_homotopy(dense, plan.homotopy_steps))
             for pivot in (0.5, 0.0, 1.0):
                 yield from tracked("zoom", zoom_homotopy(dense, plan.homotopy_steps, pivot))
-
-
-def _what_hides(shown: Demonstration, limit: float) -> str:
-    """What hides the motion in a recording: noise, read off its fourth differences, or steps; "" if little does."""
-    positions = shown.positions.numpy()
-    if len(positions) < 10:
-        return ""
-    noise = jitter(positions, 4) / shown.size
-    if noise > limit:
-        return f"noise of {noise:.2g} of its size hides the motion"
-    moves = np.abs(np.diff(positions, axis=0))
-    steps = [float(np.median(one[one > 0])) for one in moves.T if 0 < np.count_nonzero(one) < len(one) / 2]
-    if steps and max(steps) > limit * shown.size:
-        return f"recorded in steps of {max(steps) / shown.size:.2g} of its size, which hide the motion between them"
-    return ""
 
 
 def refuse_crossings(path: Array, origin: Array, unit: float) -> None:

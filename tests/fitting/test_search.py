@@ -16,8 +16,8 @@ import pytest
 import torch
 
 from latentds import Demonstration, FitWarning, TubeDS
+from latentds.findings import what_hides
 from latentds.fitting import search
-from latentds.fitting.search import _what_hides
 from latentds.methods import tube
 from tests.motions import planar_spiral
 
@@ -45,9 +45,9 @@ def test_what_hides_the_motion_is_told_with_its_size(spoil, told):
         shown = Demonstration(spoil(wave(), share), 0.01)
         # The noise of a point is the median length of three coordinates' noise; a step is one coordinate's.
         expected = share * 2 / shown.size * (1.54 if spoil is noisy else 1)
-        assert float(re.match(told, _what_hides(shown, 0.02))[1]) == pytest.approx(expected, rel=0.1)
-    assert _what_hides(Demonstration(spoil(wave(), 0.005), 0.01), 0.02) == ""
-    assert _what_hides(Demonstration(wave(), 0.01), 0.02) == _what_hides(Demonstration(wave(9), 0.01), 0.02) == ""
+        assert float(re.match(told, what_hides(shown.positions.numpy(), 0.02))[1]) == pytest.approx(expected, rel=0.1)
+    assert what_hides(spoil(wave(), 0.005), 0.02) == ""
+    assert what_hides(wave(), 0.02) == what_hides(wave(9), 0.02) == ""
 
 
 @pytest.mark.slow
@@ -57,7 +57,7 @@ def test_a_fit_to_a_blurred_recording_says_so_and_searches_no_deeper(spoil, monk
     shown = Demonstration(spoil(wave(), 0.05), 0.01)
     with pytest.warns(FitWarning) if spoil is noisy else contextlib.nullcontext():
         ds = TubeDS(3, refined=False).fit(shown)
-    assert ds.fit_report.notes[0] == _what_hides(shown, 0.02) != ""
+    assert ds.fit_report.notes[0] == what_hides(shown.positions.numpy(), 0.02) != ""
     assert ds.fit_report.n_layers <= search.PLAN.n_layers
 
 
