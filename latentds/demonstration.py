@@ -161,10 +161,13 @@ class Demonstration:
     ) -> Demonstration:
         """Read a recording: what :meth:`save` wrote, or a file of your own.
 
-        ``.csv``, ``.tsv``, ``.txt`` and ``.dat`` (any usual delimiter, decimal points or commas, with names or
-        without), ``.npy``, ``.npz`` (no pickles), ``.mat`` and ``.json``. Time and positions are found by their names,
-        and the time by its even steps if there are none; velocities and efforts are left out. What was understood is
-        said in ``origin`` and logged. Nothing ambiguous is guessed: the error says what was seen and what to pass.
+        ``.csv``, ``.tsv``, ``.txt``, ``.dat`` and ``.log`` (any usual delimiter, decimal points or commas, with names
+        or without, Motive's exports), ``.npy``, ``.npz`` (no pickles), ``.mat``, ``.json``, and with
+        ``latentds[recordings]`` ``.parquet``, ``.h5``, ``.c3d`` and ROS bags. Time and positions are found by their
+        names, and the time by its even steps if there are none; velocities and efforts are left out. Angles that wrap
+        are unwrapped, and quaternions kept on one sign. What was understood and done is said in ``origin`` and logged.
+        Nothing ambiguous is guessed: the error says what was seen and what to pass. :meth:`check` says what else would
+        hurt a fit.
 
         Args:
             path: the file.
@@ -226,13 +229,13 @@ class Demonstration:
 
     @classmethod
     def _of(cls, motion: recordings.Motion, name: str) -> Demonstration:
-        logger.info(motion.origin)
         if motion.dt is not None:
-            return cls(
-                torch.from_numpy(motion.positions), motion.dt, name, columns=motion.columns, origin=motion.origin
-            )
-        even = cls.from_times(motion.times, motion.positions, name)
-        return replace(even, columns=motion.columns, origin=motion.origin)
+            read = cls(torch.from_numpy(motion.positions), motion.dt, name)
+        else:
+            read = cls.from_times(motion.times, motion.positions, name)
+        read = replace(read, columns=motion.columns, origin=motion.origin).unwrapped().continuous()
+        logger.info(read.origin)
+        return read
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a ``.npz`` (exact) or ``.csv`` (17 digits, no names) file that :meth:`load` reads. Atomic."""

@@ -164,7 +164,7 @@ class Fidelity:
     def notes(self) -> tuple[str, ...]:
         """What is off, in words, the worst first; then what may be, if the coordinates have different units."""
         off = [words for badness, words in sorted(self.findings, reverse=True) if not badness <= 1]
-        if not self.coordinate <= COORDINATE_LIMIT:
+        if not off and self.coordinate > COORDINATE_LIMIT:
             off.append(
                 f"a coordinate that moves little is missed by {self.coordinate:.3g} of its own range: if its unit is "
                 "another one, such as rad beside mm, scale the coordinates to like ranges before the fit"

@@ -59,8 +59,8 @@ was farther away than the third in between. Looked at on so many points."""
 STARTS_APART, GOALS_APART, TIMES_APART = 0.3, 0.05, 2.0
 """Several demonstrations differ if starts or goals are so many sizes from their mean, or if the longest or slowest is
 so many times the shortest or fastest."""
-CERTAIN = ("wrap", "flip", "jump", "glitch", "loop", "crossing")
-"""Kinds that hurt every fit."""
+CERTAIN = ("wrap", "flip", "jump", "glitch")
+"""Kinds that hurt a robot although a fit may follow them."""
 
 
 class Motion(Protocol):
@@ -99,8 +99,16 @@ class Finding:
 
     @property
     def certain(self) -> bool:
-        """Whether it hurts every fit."""
+        """Whether it hurts although a fit may follow it."""
         return self.kind in CERTAIN
+
+    def places(self, count: int) -> list[tuple[int, int]]:
+        """The first and last rows of what it marks among ``count`` rows."""
+        first, last = self.rows
+        if self.kind == "rest":  # what is left of the reach, and right of it
+            return [(0, first), (last, count - 1)]
+        apart = self.kind in ("loop", "crossing", "near crossing")
+        return [(first, first), (last, last)] if apart else [(first, last)]
 
     def __str__(self) -> str:
         return self.text

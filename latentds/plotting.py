@@ -7,7 +7,8 @@ Save one with ``figure.savefig("name.png")``. A method has the same colour in ev
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import textwrap
+from collections.abc import Mapping, Sequence
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
 from zlib import crc32
@@ -21,6 +22,7 @@ from .demonstration import Demonstration
 
 try:
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
     from matplotlib.ticker import LogLocator, MaxNLocator
 except ImportError as error:
     raise ImportError("plotting needs matplotlib: pip install 'latentds[studies]'") from error
@@ -189,6 +191,30 @@ def joints(demonstration: Demonstration, paths: Mapping[str, Any], title: str = 
     rows[-1].set_xlabel("time [s]")
     figure.legend(loc="outside lower center", ncols=len(moved) + 1, fontsize=9, frameon=False)
     figure.align_ylabels(list(rows))
+    return figure
+
+
+def checked(shown: Sequence[Demonstration]) -> Figure:
+    """Every coordinate of demonstrations over time, a column each, with what their check finds marked; any n."""
+    figure = Figure(figsize=(7.5 * len(shown), 1.6 + 1.25 * shown[0].dim), dpi=DPI, layout="constrained")
+    grid = figure.subplots(shown[0].dim, len(shown), sharex="col", squeeze=False)
+    for column, one in zip(grid.T, shown, strict=True):
+        found = list(one.check())
+        for k, axes in enumerate(column):
+            axes.plot(one.times.numpy(), one.positions[:, k].numpy(), color="#444444", lw=1.2)
+            for number, finding in enumerate(found):
+                if finding.column in (None, k):
+                    for first, last in finding.places(len(one)):
+                        ends = (first - 0.5) * one.dt, (last + 0.5) * one.dt
+                        axes.axvspan(*ends, color=f"C{number}", alpha=0.3)
+            axes.set_ylabel(_labels(one)[k])
+            axes.spines[["top", "right"]].set_visible(False)
+        column[0].set_title(one.name)
+        column[-1].set_xlabel("time [s]")
+        marks = [
+            Patch(color=f"C{number}", alpha=0.3, label=textwrap.fill(str(f), 95)) for number, f in enumerate(found)
+        ]
+        column[-1].legend(handles=marks, loc="upper center", bbox_to_anchor=(0.5, -0.6), fontsize=8, frameon=False)
     return figure
 
 

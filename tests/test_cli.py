@@ -23,7 +23,7 @@ from latentds.__main__ import main
 from latentds.cli import given
 from latentds.testing import wavy_motion
 
-QUICK = ["--method", "TubeDS,n_layers=20,refined=False"]
+QUICK = ["--method", "TubeDS,n_layers=100,refined=False"]
 ROOT = Path(__file__).parents[1]
 
 
@@ -69,7 +69,7 @@ def test_fit_tells_what_it_understood_and_how_it_follows(folder):
     said, told = run("fit", "mine.csv", *QUICK)
     assert told.strip() == Demonstration.load("mine.csv").origin
     ds = latentds.load("mine.safetensors")
-    assert ds.settings == {**latentds.TubeDS(3).settings, "n_layers": 20, "refined": False}
+    assert ds.settings == {**latentds.TubeDS(3).settings, "n_layers": 100, "refined": False}
     assert ds.fit_report.columns == ("q_hip", "q_knee", "q_foot")
     assert f"{ds.fit_report.fidelity.miss:.3g}" in said
     for note in ds.fit_report.notes:
@@ -238,7 +238,7 @@ def test_report_of_recordings_and_of_a_system(folder, system):
     ds.float().save("single.safetensors")
     run("report", "single.safetensors", "--starts", 1)
     assert "TubeDS follows wavy: it stays" in (folder / "single.html").read_text()
-    run("fit", "mine.csv", "--method", "baselines:FDM,n_layers=9")
+    run("fit", "mine.csv", "--method", "baselines:FDM,n_layers=9", "--anyway", code=3)
     run("report", "mine.safetensors", "--method", "baselines:FDM", "--starts", 1)
     assert "FDM" in (folder / "mine.html").read_text()
 
@@ -271,10 +271,10 @@ def test_a_system_of_a_plugged_in_class_is_loaded(folder, monkeypatch):
 
     point = importlib.metadata.EntryPoint("FDM", "baselines:FDM", given.PLUGINS)
     monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: {given.PLUGINS: [point]}[group])
-    run("fit", "mine.csv", "--method", "FDM,n_layers=10")
+    run("fit", "mine.csv", "--method", "FDM,n_layers=10", "--anyway", code=3)
     assert isinstance(latentds.load("mine.safetensors", classes=[FDM]), FDM)
     run("rollout", "mine.safetensors")
-    run("fit", "mine.csv", "--method", "baselines:FDM,n_layers=9,beta=0.4")
+    run("fit", "mine.csv", "--method", "baselines:FDM,n_layers=9,beta=0.4", "--anyway", code=3)
     assert latentds.load("mine.safetensors", classes=[FDM]).settings["beta"] == 0.4
 
 
@@ -350,3 +350,27 @@ def test_it_runs_as_a_module_and_completes(tmp_path):
     command = [sys.executable, "-m", "latentds"]
     done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
     assert done.stdout.split() == ["certify"]
+
+
+def test_check_says_what_would_hurt_marks_it_and_exits_with_3(folder):
+    said, _ = run("check", "mine.csv", "-o", "mine.png")
+    assert said.startswith("nothing found that would hurt a fit\nwrote mine.png")
+    rows = np.loadtxt("mine.csv", delimiter=";", skiprows=1)
+    rows[70, 2] += np.ptp(rows[:, 2])
+    np.savetxt("glitch.csv", rows[:, :4], delimiter=";", header="stamp;q_hip;q_knee;q_foot", comments="")
+    said, _ = run("check", "glitch.csv", "mine.csv", "-o", "glitch.png", code=3)
+    assert "demonstration 0: column q_knee" in said
+    assert "at row 70" in said
+    assert ".deglitched()" in said
+    assert Path("glitch.png").stat().st_size > Path("mine.png").stat().st_size
+
+
+def test_a_fit_that_does_not_follow_says_so_first_and_is_written_only_anyway(folder):
+    few = ["--method", "TubeDS,n_layers=1,refined=False"]
+    said, told = run("fit", "mine.csv", *few, code=3)
+    assert "It does NOT follow what it was shown: it " in told
+    assert "mine.safetensors was not written; --anyway writes it" in said
+    assert not Path("mine.safetensors").exists()
+    said, _ = run("fit", "mine.csv", *few, "--anyway", code=3)
+    assert "wrote mine.safetensors" in said
+    assert not latentds.load("mine.safetensors").fit_report.fidelity.follows

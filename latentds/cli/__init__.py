@@ -23,7 +23,7 @@ from rich.table import Table
 from rich.text import Text
 from typer.core import TyperGroup
 
-from .. import benchmark, fidelity, recordings
+from .. import benchmark, fidelity, findings, recordings
 from ..base import FitReport, StableDS
 from ..cell import Cell, Factory, RolloutProtocol, interrupts_kept, judge
 from ..certificate import certify as certified
@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 HTML = (".html", ".htm")
 NOT_FITTED = "source: expected a system that keeps its demonstration, got one that was not fitted"
+DOUBTFUL = 3
+"""The exit status of what was done and should be looked at: 1 is an error, 2 one of usage."""
 RADIUS = 0.05
 """Of the ball of perturbed starts, in sizes of the motion: the 0.1 of the paper, whose spirals are 2 wide."""
 
@@ -97,8 +99,36 @@ def demo(
 
 @app.command()
 @reads_recordings
+def check(files: given.Recordings, out: given.Out = None, *, options: RecordingOptions) -> None:
+    """Say what in a recording would hurt a fit, where and what helps, and exit with 3 if there is something.
+
+    \b
+    latentds check mine.csv
+    latentds check first.csv second.csv -o mine.png        every coordinate over time, with the places marked
+    """
+    path = None if out is None else given.target(out, files, "", (".png", ".svg", ".pdf"))
+    shown = options.read(files)
+    found = findings.Check(findings.every_finding(shown))
+    tell(str(found))
+    if path is not None:
+        from .. import plotting
+
+        with atomic_write(path) as file:
+            plotting.checked(shown).savefig(file, format=path.suffix[1:].lower())
+        tell(f"wrote {path}")
+    if len(found):
+        raise typer.Exit(DOUBTFUL)
+
+
+@app.command()
+@reads_recordings
 def fit(
-    files: given.Recordings, out: given.Out = None, method: given.Method = "TubeDS", *, options: RecordingOptions
+    files: given.Recordings,
+    out: given.Out = None,
+    method: given.Method = "TubeDS",
+    anyway: Annotated[bool, typer.Option("--anyway", help="Write a system that does not follow, too.")] = False,
+    *,
+    options: RecordingOptions,
 ) -> None:
     """Learn a system from a recording, or from several of one motion, and say how it follows them.
 
@@ -107,6 +137,8 @@ def fit(
     latentds fit first.csv second.csv -o reach.safetensors
     latentds fit log.csv --columns x,y,z --time stamp --unit ms
     latentds fit mine.csv --method Chebyshev,n_layers=200
+
+    A system that does not follow is written only with --anyway, and the exit status is 3 then, too.
     """
     path = given.target(out, files, ".safetensors")
     if path.suffix.lower() in recordings.READERS:
@@ -116,10 +148,18 @@ def fit(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FitWarning)  # the table tells it
         ds = given.fitted(make(shown[0].dim), shown)
-    ds.save(path)
-    if isinstance(ds.fit_report, FitReport):
-        tell_fit(ds.fit_report, type(ds).__name__)
-    tell(f"wrote {path}")
+    report = ds.fit_report
+    assert isinstance(report, FitReport)
+    follows = report.fidelity is not None and report.fidelity.follows
+    if not follows:
+        off = report.fidelity.notes[0] if report.fidelity else report.notes[-1]
+        say(f"It does NOT follow what it was shown: it {off}.", "red")
+    tell_fit(report, type(ds).__name__)
+    if follows or anyway:
+        ds.save(path)
+    tell(f"wrote {path}" if follows or anyway else f"{path} was not written; --anyway writes it")
+    if not follows:
+        raise typer.Exit(DOUBTFUL)
 
 
 def tell_fit(report: FitReport, title: str) -> None:

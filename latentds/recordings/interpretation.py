@@ -27,8 +27,6 @@ EVERYDAY_DURATION = (0.05, 3600.0)
 """Seconds that such a recording takes."""
 EVERYDAY_DATE = (9e8, 4e9)
 """Seconds since 1970 of the years 1998 to 2096."""
-INDEX_NAME = re.compile(r"column 0|Unnamed: 0|index|level_0|")
-"""What the index of a data frame is called in a file that it was written to."""
 MOST_REPEATED = 0.05
 """Share of rows with the time of the row before that are left out; more of them are a clock that is too coarse."""
 GAP = 10.0
@@ -195,8 +193,6 @@ class _Interpretation:
 
     def _columns_of(self, block: str, kind: str) -> list[_Column]:
         array, dated = self.arrays[block], None
-        if array.ndim == 1 and INDEX_NAME.fullmatch(block) and counts_rows(array):
-            kind = "other"  # a data frame's index, written with it
         if array.dtype.kind in "Mm":
             array, kind, dated = (array - array[0]) / np.timedelta64(1, "ns") * 1e-9, "time", "s"
         labels = names = [block]
