@@ -175,7 +175,7 @@ class StableDS(nn.Module, ABC):
 
         Warns:
             FitWarning: if the system does not follow what it was shown, or may not follow a coordinate of another unit,
-                or if something in what was shown (:mod:`latentds.findings`) hurts every fit.
+                or if something in what was shown (:mod:`latentds.findings`) would hurt a robot that follows it.
         """
         shown = demonstrations_of(demonstration, self.dim)
         with _restored_on_failure(self):

@@ -328,10 +328,10 @@ class _Search:
         with torch.no_grad():
             high = self.ds.lyapunov(self.points)
             around = self.ds.lyapunov(rings).abs()
-            beside = rings[around.amax(-1).argmin()]  # V may be steep, and need not be low on each of them
-            low = self.ds.lyapunov(torch.cat([self.goal.unsqueeze(0), beside])).abs() / high.max()
+            best = around.amax(-1).argmin()  # V may be steep, and need not be low on each of them
+            low = torch.cat([self.ds.lyapunov(self.goal).abs().unsqueeze(0), around[best]]) / high.max()
         badness = torch.cat([torch.where(high > 0, 0.0, math.inf), low])
-        points = torch.cat([self.points, self.goal.unsqueeze(0), beside])
+        points = torch.cat([self.points, self.goal.unsqueeze(0), rings[best]])
         claim, detail = "V is above 0, and falls to 0 at the attractor", "V beside it over the largest"
         return self._judge(claim, badness, 1e-2, detail, points)
 

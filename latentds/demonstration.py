@@ -233,7 +233,8 @@ class Demonstration:
             read = cls(torch.from_numpy(motion.positions), motion.dt, name)
         else:
             read = cls.from_times(motion.times, motion.positions, name)
-        read = replace(read, columns=motion.columns, origin=motion.origin).unwrapped().continuous()
+        read = replace(read, columns=motion.columns, origin=motion.origin)
+        read = read if motion.ours else read.unwrapped().continuous()
         logger.info(read.origin)
         return read
 

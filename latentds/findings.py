@@ -7,7 +7,6 @@ mended and rests left out before what comes after them is looked for.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -35,8 +34,6 @@ JUMP_TIMES, JUMP_SIZE, JUMP_RANGE, JUMP_LEAST = 8.0, 0.01, 0.2, 1e-3
 large in sizes, or in ranges of a column that has another unit; below the last number of sizes a column rests."""
 GLITCH_ROWS, GLITCH_BACK = 5, 0.3
 """A jump that goes back within so many rows, but for so much of it, is a glitch."""
-GAP_TIMES, GAP_SHARE = 5.0, 0.01
-"""Stamps are a gap apart if they are so many times the usual step, and so much of the duration."""
 BRIDGE_ROWS, BRIDGE_OTHERS = 10, 0.02
 """So many equal steps are a gap that was bridged straight, if no more than such a share of the others are equal."""
 REPEAT_SHARE, REPEAT_STEP = 0.1, 0.3
@@ -156,17 +153,12 @@ def every_finding(shown: Sequence[Motion]) -> tuple[Finding, ...]:
     return (*each, *findings_between(shown))
 
 
-def findings(shown: Motion, times: Array | None = None) -> tuple[Finding, ...]:
-    """What in a demonstration would hurt a fit, in a hundredth of a second.
-
-    Args:
-        shown: the demonstration.
-        times: (M,) seconds, the stamps that it was recorded at, if they are known; gaps are then told by them.
-    """
-    return tuple(_findings(shown, times))
+def findings(shown: Motion) -> tuple[Finding, ...]:
+    """What in a demonstration would hurt a fit, in a hundredth of a second."""
+    return tuple(_findings(shown))
 
 
-def _findings(shown: Motion, times: Array | None) -> Iterator[Finding]:
+def _findings(shown: Motion) -> Iterator[Finding]:
     points, names, dt = shown.positions.numpy(), shown.columns, shown.dt
     for column, (period, rows) in wraps(points).items():
         word, value = _name(names, column), PERIODS[period]
@@ -179,7 +171,7 @@ def _findings(shown: Motion, times: Array | None) -> Iterator[Finding]:
         yield Finding("flip", (rows[0], rows[-1]), four[0], 1.0, "units", said)
     points = continuous(points, names)
     size = extent(points)
-    yield from _gaps(points, dt, times)
+    yield from _gaps(points, dt)
     runs = repeats(points)
     if runs:
         count = sum(last - first for first, last in runs)
@@ -187,7 +179,8 @@ def _findings(shown: Motion, times: Array | None) -> Iterator[Finding]:
         said = f"{count} {'rows repeat' if count > 1 else 'row repeats'} the one before, {_rows(rows)}: .deglitched()"
         yield Finding("repeat", (rows[0], runs[-1][1]), None, float(count), "rows", said)
     points = bridged(points, runs)
-    for one in jumps(points):
+    lone = jumps(points)
+    for one in lone:
         where = f"at row {one.first}" if one.first == one.last else f"in rows {one.first} to {one.last}"
         much = f"{one.length / size:.2g} of the size, {_times(one.times)} the usual step"
         word = _name(names, one.column)
@@ -196,7 +189,7 @@ def _findings(shown: Motion, times: Array | None) -> Iterator[Finding]:
         else:
             said = f"{word} jumps at row {one.last} ({much}): .split_at([{one.last}])"
         yield Finding("glitch" if one.back else "jump", (one.first, one.last), one.column, one.times, "times", said)
-    points = bridged(points, [(one.first - 1, one.last) for one in jumps(points) if one.back])
+    points = bridged(points, [(one.first - 1, one.last) for one in lone if one.back])
     first, last = reach(points)
     if (first, last) != (0, len(points) - 1):
         until = [f"until {first * dt:.3g} s"] if first else []
@@ -210,11 +203,9 @@ def _findings(shown: Motion, times: Array | None) -> Iterator[Finding]:
         said = f"waits for {(end - start) * dt:.3g} s at row {start}, which no autonomous system does"
         yield Finding("pause", (start, end), None, (end - start) * dt, "s", f"{said}: .split_at([{end}])")
     if hidden := what_hides(points, HIDDEN):
-        noise, whole = hidden.startswith("noise"), (0, len(points) - 1)
-        share = float(re.findall(r"[\d.e-]+\d|\d", hidden)[0])
         said = f"{hidden}: .smoothed({0.05 * dt * (len(points) - 1):.2g}), in seconds"
-        yield Finding("noise" if noise else "steps", whole, None, share, "sizes", said)
-    yield from _meetings(moving, first, size, bool(hidden))
+        yield Finding(hidden.kind, (0, len(points) - 1), None, hidden.share, "sizes", said)
+    yield from _meetings(moving, first, size, hidden is not None)
 
 
 def findings_between(shown: Sequence[Motion]) -> Iterator[Finding]:
@@ -401,23 +392,18 @@ def jumps(points: Array) -> list[Jump]:
             found.append(Jump(row, row + 1, False, column, length, times))
         else:
             found.append(Jump(row + 1, back, True, column, length, times))
-        at += 1 if back is None else rows.index(back) + 1 - at
+        at = at + 1 if back is None else rows.index(back) + 1
     return found
 
 
-def _gaps(points: Array, dt: float, times: Array | None) -> Iterator[Finding]:
-    if times is not None:
-        apart = np.diff(times)
-        usual = float(np.median(apart))
-        wide = np.flatnonzero((apart > GAP_TIMES * usual) & (apart > GAP_SHARE * (times[-1] - times[0])))
-        spans = [(int(np.floor((times[i] - times[0]) / dt)), float(apart[i])) for i in wide]
-    else:
-        moves = np.diff(points, axis=0)
-        equal = (np.abs(np.diff(moves, axis=0)) <= 1e-9 * np.abs(points).max()).all(1) & moves[1:].any(1)
-        runs = [run for run in _runs(equal) if run[1] - run[0] >= BRIDGE_ROWS]
-        others = np.count_nonzero(equal) - sum(last - first for first, last in runs)
-        lone = len(runs) and others <= BRIDGE_OTHERS * len(equal) and sum(b - a for a, b in runs) < len(equal) / 2
-        spans = [(first, (last - first + 1) * dt) for first, last in runs] if lone else []
+def _gaps(points: Array, dt: float) -> Iterator[Finding]:
+    """Where rows are missing and a straight line stands for them: by many equal steps where hardly any are."""
+    moves = np.diff(points, axis=0)
+    equal = (np.abs(np.diff(moves, axis=0)) <= 1e-9 * np.abs(points).max()).all(1) & moves[1:].any(1)
+    runs = [run for run in _runs(equal) if run[1] - run[0] >= BRIDGE_ROWS]
+    others = np.count_nonzero(equal) - sum(last - first for first, last in runs)
+    lone = len(runs) and others <= BRIDGE_OTHERS * len(equal) and sum(b - a for a, b in runs) < len(equal) / 2
+    spans = [(first, (last - first + 1) * dt) for first, last in runs] if lone else []
     for first, seconds in spans:
         last = min(first + math.ceil(seconds / dt), len(points) - 1)
         said = f"{seconds:.3g} s are missing at row {first}, {seconds / dt:.0f} times the usual step"
@@ -459,19 +445,31 @@ def _pauses(points: Array) -> list[tuple[int, int]]:
     return [(first, last) for first, last in long if first > 0 and last < len(speeds)]
 
 
-def what_hides(positions: Array, limit: float) -> str:
-    """What hides the motion in a recording: noise, read off its fourth differences, or steps; "" if little does."""
+class Hidden(NamedTuple):
+    """What hides a motion in its recording: "noise" or "steps", and of how many sizes."""
+
+    kind: str
+    share: float
+
+    def __str__(self) -> str:
+        if self.kind == "noise":
+            return f"noise of {self.share:.2g} of its size hides the motion"
+        return f"recorded in steps of {self.share:.2g} of its size, which hide the motion between them"
+
+
+def what_hides(positions: Array, limit: float) -> Hidden | None:
+    """Noise above a limit in sizes, read off fourth differences, or steps; None if little hides the motion."""
     if len(positions) < 10:
-        return ""
+        return None
     size = extent(positions)
     noise = jitter(positions, 4) / size
     if noise > limit:
-        return f"noise of {noise:.2g} of its size hides the motion"
+        return Hidden("noise", noise)
     moves = np.abs(np.diff(positions, axis=0))
     steps = [float(np.median(one[one > 0])) for one in moves.T if 0 < np.count_nonzero(one) < len(one) / 2]
     if steps and max(steps) > limit * size:
-        return f"recorded in steps of {max(steps) / size:.2g} of its size, which hide the motion between them"
-    return ""
+        return Hidden("steps", max(steps) / size)
+    return None
 
 
 def _meetings(points: Array, offset: int, size: float, hidden: bool) -> Iterator[Finding]:

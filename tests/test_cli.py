@@ -374,3 +374,21 @@ def test_a_fit_that_does_not_follow_says_so_first_and_is_written_only_anyway(fol
     said, _ = run("fit", "mine.csv", *few, "--anyway", code=3)
     assert "wrote mine.safetensors" in said
     assert not latentds.load("mine.safetensors").fit_report.fidelity.follows
+
+
+def test_one_motion_of_a_file_or_all_are_taken(folder):
+    motion = datasets.joint_motion(0, 150)
+    np.savez("two.npz", q=np.stack([motion.positions[:, :3], motion.positions[:, :3] + 0.01]), dt=motion.dt)
+    line = refused("fit", "two.npz")
+    assert line.startswith("latentds: episode: expected one motion, got 2 in two.npz")
+    assert line.endswith("pass --episode, or take all of them: --episode all")
+    run("rollout", "two.npz", "--episode", "1", *QUICK)
+    assert np.loadtxt("two-rollout.csv", delimiter=",", skiprows=1)[0, 1:] == pytest.approx(motion.start[:3] + 0.01)
+    assert "two.npz[0]: 150 rows" in run("check", "two.npz", "--episode", "all", "-o", "two.png")[1]
+    with pytest.raises(FileNotFoundError):
+        given.RecordingOptions(episode="1").read([Path("none.npz")])
+
+
+def test_a_folder_is_no_system(folder):
+    Path("bag").mkdir()
+    assert "expected a file of kind" in refused("rollout", "bag")

@@ -58,7 +58,8 @@ class Group(TyperGroup):
                 say("latentds: interrupted", "red")
                 raise typer.Exit(130) from None
             except (ValueError, OSError, ImportError) as error:
-                text = re.sub(r"\b(columns|time|unit|dt)=(?=[\s),.;]|$)", r"--\1", " ".join(str(error).split()))
+                text = re.sub(r"\b(columns|time|unit|dt|episode)=(?=[\s),.;]|$)", r"--\1", " ".join(str(error).split()))
+                text = text.replace("Demonstration.load_all", "--episode all")
                 say(f"latentds: {text}", "red")
                 raise typer.Exit(1) from None
 

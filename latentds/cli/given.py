@@ -38,7 +38,8 @@ Source = Annotated[
     ),
 ]
 Recordings = Annotated[
-    list[Path], typer.Argument(help="Tables of text, .npy, .npz, .mat or .json files.", show_default=False)
+    list[Path],
+    typer.Argument(help=f"Files of kind {' '.join(recordings.READERS)}, or bags of ROS 2.", show_default=False),
 ]
 METHOD_HELP = "A name that `latentds compare --help` lists, or module:Class; settings after it: TubeDS,n_layers=100."
 Method = Annotated[str, typer.Option(help=METHOD_HELP)]
@@ -57,6 +58,7 @@ Columns = Annotated[
 Time = Annotated[str | None, _option(help="Column of time stamps.")]
 Unit = Annotated[str | None, _option(help="Of the time stamps: s, ms, us or ns.")]
 Dt = Annotated[float | None, _option(help="Seconds between two rows; time stamps are not looked at.")]
+Episode = Annotated[str | None, _option(help="Which motion of a file that holds several, by its label, or all.")]
 
 
 def say(text: str, style: str = "") -> None:
@@ -73,9 +75,11 @@ def tell(item: str | Table) -> None:
 class RecordingOptions:
     """The options that say how recordings are to be read, the same for every command that reads some."""
 
-    def __init__(self, columns: Columns = None, time: Time = None, unit: Unit = None, dt: Dt = None) -> None:
+    def __init__(
+        self, columns: Columns = None, time: Time = None, unit: Unit = None, dt: Dt = None, episode: Episode = None
+    ) -> None:
         self.columns = [name.strip() for text in columns or () for name in text.split(",")] or None
-        self.time, self.unit, self.dt = time, unit, dt
+        self.time, self.unit, self.dt, self.episode = time, unit, dt, episode
 
     def read(self, paths: Sequence[Path]) -> list[Demonstration]:
         """The recordings, under names that differ; each is described in a line on stderr."""
@@ -88,14 +92,20 @@ class RecordingOptions:
             columns = None if self.columns is None else [number(name) for name in self.columns]
             time = None if self.time is None else number(self.time)
             twin = sum(path.stem == other.stem for other in paths) > 1
-            name = str(path) if twin else None
-            shown.append(Demonstration.load(path, columns=columns, time=time, unit=self.unit, dt=self.dt, name=name))
-            say(shown[-1].origin, "dim")
+            how: dict[str, Any] = {"columns": columns, "time": time, "unit": self.unit, "dt": self.dt}
+            if self.episode == "all":
+                several = Demonstration.load_all(path, **how)
+            else:
+                name = f"{path}{f'[{self.episode}]' if self.episode else ''}" if twin else None
+                several = [Demonstration.load(path, **how, episode=self.episode, name=name)]
+            for one in several:
+                say(one.origin, "dim")
+            shown += several
         return shown
 
     def refuse(self, path: Path) -> None:
         """Raise ValueError if one of the options is given: a file with a system is not a recording."""
-        for name in ("columns", "time", "unit", "dt"):
+        for name in ("columns", "time", "unit", "dt", "episode"):
             if getattr(self, name) is not None:
                 raise ValueError(f"{name}: expected a recording, got a system: {path}")
 
@@ -168,8 +178,8 @@ def _literal(text: str) -> Any:
 
 
 def is_system(paths: Sequence[Path]) -> bool:
-    """Whether a command is given one file, and not of a kind that recordings have."""
-    return len(paths) == 1 and paths[0].suffix.lower() not in recordings.READERS
+    """Whether a command is given one file, and not of a kind that recordings have; nor a folder, which a bag may be."""
+    return len(paths) == 1 and paths[0].suffix.lower() not in recordings.READERS and not paths[0].is_dir()
 
 
 def loaded(path: Path, method: str = "") -> tuple[StableDS, list[Demonstration]]:

@@ -359,7 +359,7 @@ class Search:
         best, least = min([(least, best), *again], key=lambda pair: pair[0])[::-1]
         motion = trial(best).rollout(shown.start, torch.from_numpy(even)).numpy()
         missed = dtw(motion, shown.at(even)) / len(even) / shown.size
-        notes = [hidden] if hidden else []
+        notes = [str(hidden)] if hidden else []
         if least > 1 and not hidden:
             near = float(Strands(path, plan.n_points).clearance(path).min())
             notes.append(f"no match tried follows the path closely; its strands come within {near:.2g} of its size")

@@ -14,7 +14,7 @@ from .readers import Table
 
 LEAST_ROWS = 3
 """Of a motion."""
-NUMBERED = re.compile(r"^(?P<before>(?:.*/)?)(?P<which>[^/\d]*\d+)(?P<after>/.*)?$")
+NUMBERED = re.compile(r"^(?P<before>(?:.*/)?)(?P<stem>[^/\d]*)(?P<number>\d+)(?P<after>/.*)?$")
 """A name of which one part, between slashes, ends with a number."""
 
 
@@ -37,7 +37,11 @@ def _by_column(table: Table) -> tuple[str, dict[str, Table]]:
         if not told or column.ndim != 1 or len(column) < LEAST_ROWS:
             continue
         starts = np.flatnonzero(column[1:] != column[:-1]) + 1
-        labels = [str(int(v) if column.dtype.kind == "f" and v == int(v) else v) for v in column[[0, *starts]]]
+        if len(starts) and np.diff([0, *starts, len(column)]).min() < LEAST_ROWS:
+            continue  # a coordinate of that name
+        values = column[[0, *starts]]
+        whole = values.dtype.kind == "f" and bool((values == values.round()).all())
+        labels = [str(value) for value in (values.astype(np.int64) if whole else values)]
         if len(set(labels)) == len(labels):
             return f"column {name!r}", _rows(table, len(column), starts, labels)
     return "", {}
@@ -66,24 +70,26 @@ def _rows(table: Table, count: int, starts: NDArray[Any], labels: list[str]) -> 
 
 
 def _by_name(table: Table) -> tuple[str, dict[str, Table]]:
+    numbered = {name: match for name, a in table.items() if a.ndim and (match := NUMBERED.match(name))}
+    stems = {match["stem"] for match in numbered.values()}
     parts: dict[str, Table] = {}
-    befores = set()
-    for name, array in table.items():
-        if array.ndim and (match := NUMBERED.match(name)):
-            befores.add(match["before"])
-            inside = (match["before"] + (match["after"] or "")[1:]).strip("/")
-            parts.setdefault(match["which"], {})[inside] = array
+    for name, match in numbered.items():
+        label, kept = (match["stem"] + match["number"], "") if len(stems) == 1 else (match["number"], match["stem"])
+        inside = (match["before"] + kept + (match["after"] or "")).replace("//", "/").strip("/")
+        parts.setdefault(label, {})[inside] = table[name]
     wide = all(any(a.ndim == 2 and min(a.shape) > 1 for a in part.values()) for part in parts.values())
     alike = len({frozenset(part) for part in parts.values()}) == 1
+    together = len({match["before"] for match in numbered.values()}) == 1
     shared = {name: array for name, array in table.items() if array.ndim == 0}
-    how = f"names such as {next((n for n in table if NUMBERED.match(n)), '')!r}"
-    return how, {label: shared | part for label, part in parts.items()} if wide and alike and len(befores) == 1 else {}
+    how = f"names such as {next(iter(numbered), '')!r}"
+    return how, {label: shared | part for label, part in parts.items()} if wide and alike and together else {}
 
 
 def _by_axis(table: Table) -> tuple[str, dict[str, Table]]:
     stacks = {name: a for name, a in table.items() if a.ndim == 3 and a.dtype.kind in "fiu"}
     counts = {len(a) for a in stacks.values()}
-    if len(counts) != 1:
+    rows = {len(a) for name, a in table.items() if a.ndim == 1 and vocabulary.is_time(name)}
+    if len(counts) != 1 or counts & rows:  # with a time for each along the first axis it is rows of several points
         return "", {}
     count = counts.pop()
     several = {name for name, a in table.items() if a.ndim > 1 and len(a) == count}

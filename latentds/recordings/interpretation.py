@@ -45,7 +45,8 @@ DERIVATIVE_WITHIN = 0.3
 class Motion:
     """(N, n) ``positions`` at (N,) ``times``, seconds from the first row, or ``dt`` seconds apart.
 
-    ``columns``: n names, or none if the recording has none; ``origin``: one line that says what was taken for what.
+    ``columns``: n names, or none if the recording has none; ``origin``: one line that says what was taken for what;
+    ``ours``: whether :meth:`~latentds.Demonstration.save` wrote it.
     """
 
     positions: Array
@@ -53,6 +54,7 @@ class Motion:
     dt: float | None
     columns: tuple[str, ...]
     origin: str
+    ours: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +102,7 @@ def interpret(table: Table, label: str, asked: Asked, episode: str | int | None)
     if episode is None and parts and asked.columns is None:
         raise ValueError(
             f"episode: expected one motion, got {len(parts)} in {label}, by {how}: {_shortened(list(parts))}; "
-            "pass episode=, or take all of them with Demonstration.load_all"
+            "pass episode=, or take all of them: Demonstration.load_all"
         )
     if episode is not None:
         if str(episode) not in parts:
@@ -187,7 +189,7 @@ class _Interpretation:
         if not all(labels) or len(set(labels)) < len(labels) or (self.ours and "columns" not in self.texts):
             labels = ()
         origin = f"{self.label}: {'; '.join([*parts, *self.remarks])}"
-        return Motion(positions, timing.times, timing.dt, labels, origin)
+        return Motion(positions, timing.times, timing.dt, labels, origin, self.ours)
 
     # Columns -------------------------------------------------------------------------------------------------------
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Sequence, Set
 
 
@@ -96,20 +97,22 @@ def kinds_of(names: Sequence[str]) -> list[str]:
     Roll, pitch and yaw, φ, θ and ψ, and a quaternion's w are told by others of their set. A "current" before a position
     is the present one, unless the position is there without it.
     """
-    words = [words_of(name) for name in names]
-    kinds = [kind_of(name) for name in names]
-    for i, mine in enumerate(words):
+    words = [tuple(words_of(name)) for name in names]
+    known_names, beside = set(words), defaultdict[tuple[tuple[str, ...], tuple[str, ...]], set[str]](set)
+    for mine in known_names:
+        for k, word in enumerate(mine):
+            beside[mine[:k], mine[k + 1 :]].add(word)
+    kinds = []
+    for name, mine in zip(names, words, strict=True):
+        kind = kind_of(name)
         for own, known, enough in SIBLINGS:
             for k in [k for k, word in enumerate(mine) if word in own][-1:]:
-                alike = [other for other in words if other[:k] == mine[:k] and other[k + 1 :] == mine[k + 1 :]]
-                if len(known & {other[k] for other in alike if len(other) > k}) >= enough:
-                    kinds[i] = "orientation"
-        if (
-            mine[:1] == ["current"]
-            and mine[1:] not in words
-            and (kind := kind_of(" ".join(mine[1:]))) in POSITION_KINDS
-        ):
-            kinds[i] = kind
+                if len(known & beside[mine[:k], mine[k + 1 :]]) >= enough:
+                    kind = "orientation"
+        if mine[:1] == ("current",) and mine[1:] not in known_names:
+            present = kind_of(" ".join(mine[1:]))
+            kind = present if present in POSITION_KINDS else kind
+        kinds.append(kind)
     return kinds
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import pickle
 from dataclasses import replace
@@ -197,6 +198,50 @@ def test_every_motion_of_a_file_is_read_and_named(tmp_path):
         assert one.fingerprint == second.fingerprint
     (alone,) = Demonstration.load_all(tmp_path / "axis.npz", columns="q")[:1]
     assert alone.dim == 3
+
+
+MOTIONS = {
+    "joints and their velocities": ({"q_0": Q, "qd_0": V, "q_1": Q[5:], "qd_1": V[5:], "dt": DT}, ["0", "1"]),
+    "times of their own": ({"q_0": Q, "t_0": T, "q_1": Q[5:], "t_1": T[5:]}, ["0", "1"]),
+    "arm and hand": ({"q7": Q, "x3": Q + 1, "t": T}, None),
+    "markers of each row": ({"markers": np.stack([Q, Q + 1], axis=1), "q": Q, "t": T}, None),
+}
+
+
+@pytest.mark.parametrize("kind", MOTIONS)
+def test_numbers_in_names_and_first_axes_are_no_motions_by_themselves(kind, tmp_path):
+    arrays, labels = MOTIONS[kind]
+    np.savez(tmp_path / "a.npz", **arrays)
+    if labels is None:
+        with contextlib.suppress(ValueError):  # what is asked about is not of motions
+            assert len(Demonstration.load_all(tmp_path / "a.npz")) == 1
+        with contextlib.suppress(ValueError):
+            assert Demonstration.load(tmp_path / "a.npz").dim == 3
+    else:
+        shown = Demonstration.load_all(tmp_path / "a.npz")
+        assert [one.name for one in shown] == [f"a[{label}]" for label in labels]
+        np.testing.assert_allclose(shown[1].positions, Q[5:], atol=1e-12)
+
+
+@pytest.mark.parametrize("values", [Q[:, 0], np.full(N, np.nan), np.full(N, np.inf)], ids=["moves", "nan", "inf"])
+def test_a_coordinate_with_the_name_of_motions_does_not_tell_them_apart(values, tmp_path):
+    np.savez(tmp_path / "a.npz", trajectory=values, t=T)
+    if np.isfinite(values).all():
+        assert Demonstration.load(tmp_path / "a.npz").columns == ("trajectory",)
+    else:
+        with pytest.raises(ValueError, match=r"^positions: expected finite numbers"):
+            Demonstration.load(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".csv"])
+def test_its_own_files_come_back_as_they_are_and_others_unwrapped(suffix, tmp_path):
+    wrapping = np.column_stack([Q, (3 * T + 3) % (2 * np.pi)])
+    Demonstration(wrapping, DT).save(tmp_path / f"own{suffix}")
+    np.testing.assert_allclose(Demonstration.load(tmp_path / f"own{suffix}").positions, wrapping, atol=1e-14)
+    np.savez(tmp_path / "other.npz", q=wrapping, t=T)
+    other = Demonstration.load(tmp_path / "other.npz")
+    np.testing.assert_allclose(np.diff(other.positions[:, 3]), 3 * np.diff(T), atol=1e-9)
+    assert other.origin.endswith("unwrapped column 3 by 2π")
 
 
 def test_no_number_is_left_out_without_a_word(tmp_path):
