@@ -80,7 +80,8 @@ def compare(
         * ``dtw``, ``dtw_fast``: exact and FastDTW (radius 1) distance to the demonstration, raw sums; ``…_per_point``
           divided by ``n_points``. ``frechet``, ``endpoint_error``, ``path_length_ratio``: see :mod:`latentds.metrics`.
         * ``converged``: after 20 durations the motion is no further from the attractor than 1 % of the demonstration's
-          size, and the attractor no further from the demonstrated goal than 1e-6 of it.
+          size, and the attractor no further from the demonstrated goal than 1e-6 of it; of several demonstrations, from
+          the mean of their goals than the farthest of these.
         * ``velocity_rmse``, ``velocity_cosine``: the learned field against the demonstrated velocities at the
           demonstrated points, one number per judge.
         * ``mse``: the fit's own. This and all below are one number per cell.

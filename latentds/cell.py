@@ -34,7 +34,8 @@ CONVERGED_AFTER = 20.0
 CONVERGED_WITHIN = 1e-2
 """``converged``: largest distance from the attractor then, as a share of the motion's size."""
 ON_GOAL = 1e-6
-"""``converged``: largest distance of the attractor from the demonstrated goal, as a share of the motion's size."""
+"""``converged``: largest distance of the attractor from where motions were shown to end, in the motion's size; of
+several demonstrations from the mean of their goals, and no further than the farthest of these."""
 
 SCORES = (
     "dtw", "dtw_fast", "dtw_per_point", "dtw_fast_per_point", "frechet", "endpoint_error", "path_length_ratio",
@@ -232,7 +233,7 @@ def judge(ds: StableDS, cell: Cell, protocol: RolloutProtocol, *, fit_seconds: f
                 began = time.perf_counter()
                 moved = [ds.rollout(y0, protocol.times(one)) for y0, one in zip(starts, judges, strict=True)]
                 facts["rollout_seconds"] = time.perf_counter() - began
-                converged = np.stack([_converged(ds, one, y0) for y0, one in zip(starts, judges, strict=True)])
+                converged = np.stack([_converged(ds, cell, one, y0) for y0, one in zip(starts, judges, strict=True)])
         wanted = protocol.n_starts + 1, protocol.n_points, ds.dim
         for path in moved:
             if path.shape != wanted:
@@ -339,11 +340,12 @@ def _scores(path: Array, reference: Array) -> dict[str, float]:
     }
 
 
-def _converged(ds: StableDS, judge: Demonstration, starts: Tensor) -> NDArray[np.bool_]:
+def _converged(ds: StableDS, cell: Cell, judge: Demonstration, starts: Tensor) -> NDArray[np.bool_]:
     later = torch.tensor([0.0, CONVERGED_AFTER * judge.duration], dtype=torch.float64)
     left = torch.linalg.vector_norm(ds.rollout(starts, later)[:, -1] - ds.attractor, dim=-1)
-    missed = torch.linalg.vector_norm(ds.attractor - judge.goal)
-    arrived = (left <= CONVERGED_WITHIN * judge.size) & (missed <= ON_GOAL * judge.size)
+    goals = torch.stack([one.goal for one in cell.shown])
+    apart = torch.linalg.vector_norm(torch.cat([goals, ds.attractor.unsqueeze(0)]) - goals.mean(0), dim=-1)
+    arrived = (left <= CONVERGED_WITHIN * judge.size) & (apart[-1] <= apart[:-1].max() + ON_GOAL * judge.size)
     return np.asarray(arrived.numpy())
 
 

@@ -20,14 +20,18 @@ from .probes import flow_gap, restart_gap, unit_ball
 
 MISS_LIMIT = 0.05
 """Largest mean distance from the demonstration, in its sizes; good fits stay below half of it, even of 1 % noise."""
-END_LIMIT = 0.05
-"""Largest distance from the demonstrated end when the demonstration ends, in sizes of the motion."""
+END_LIMIT, SPREAD_LIMIT = 0.05, 0.1
+"""Largest distance from the demonstrated end when the demonstration ends, in sizes of the motion; and how much more is
+allowed at most where the goals of several demonstrations differ."""
 LEAST_LENGTH_RATIO, LARGEST_LENGTH_RATIO = 0.8, 1.25
 """Length of the motion over that of the demonstration: a shortcut is shorter, a detour longer."""
 NEARBY_DISTANCE, NEARBY_LIMIT = 0.01, 0.15
 """A start so near the demonstrated one, in sizes, that nobody places it better, may miss by thrice ``MISS_LIMIT``:
 a tight spiral spreads good fits that far. A motion that jumps to another strand or to the goal misses by twice it."""
-BESIDE_PATH, SPEED_LIMIT = 0.1, 20.0
+COMMAND_LIMIT = 2.0
+"""From where it was shown to begin, from beside it, and from between several such starts, no motion is so many times as
+fast as what was shown."""
+BESIDE_PATH, SPEED_LIMIT = 0.1, 5.0
 """Within so many sizes of the path no velocity exceeds the largest demonstrated one so many times. The pull of a tube
 that brings back what is so far off in a twentieth of the duration is a few times it; near a fold it is hundreds."""
 ROUNDING_LIMIT = 1e-3
@@ -126,7 +130,7 @@ class Fidelity:
         nearby: as ``miss``, the worst of ``NEARBY_STARTS`` motions from ``NEARBY_DISTANCE`` sizes beside the
             demonstrated start, or from a quarter of the way to where the demonstration comes back to it.
         fastest: largest velocity on the demonstrated path and within ``BESIDE_PATH`` sizes of it, over the largest
-            shown.
+            shown in any.
         rise: largest rise of V along the motion, over V at its start.
         restart_gap: largest distance of the motion from the same one begun anew half-way, in sizes.
         flow_gap: largest distance, in sizes, of that motion and of two from beside its start from the integral of the
@@ -134,10 +138,12 @@ class Fidelity:
         timing: mean distance of that motion from the demonstration at equal times, in sizes, after the best shift by up
             to a tenth of the duration, as one that starts to move a little later. Of several demonstrations, which one
             system cannot all keep the times of, each counts in the mean of their durations.
+        command: largest velocity along the motions from the demonstrated start, from beside it, and from between the
+            starts of several demonstrations, over the largest shown in any.
         coordinate: mean miss of one coordinate, over its own range: the worst of those that move by more than noise.
         latent_error: see :meth:`~latentds.LatentDS.latent_error`; 0 for a system without latent space.
         spread: of several demonstrations, the largest distance of a goal from the mean of their goals, in sizes. One
-            attractor cannot be nearer to all of them, so it is added to what ``end`` may be.
+            attractor cannot be nearer to all of them, so it is added, up to ``SPREAD_LIMIT``, to what ``end`` may be.
         shown: what it was held against.
     """
 
@@ -151,9 +157,15 @@ class Fidelity:
     flow_gap: float = 0.0
     timing: float = 0.0
     coordinate: float = 0.0
+    command: float = 0.0
     latent_error: float = 0.0
     spread: float = 0.0
     shown: tuple[Excerpt, ...] = field(default=(), repr=False)
+
+    @property
+    def end_limit(self) -> float:
+        """What ``end`` may be."""
+        return END_LIMIT + min(self.spread, SPREAD_LIMIT)
 
     @property
     def follows(self) -> bool:
@@ -182,12 +194,16 @@ class Fidelity:
                 f"moves {self.length_ratio:.3g} times as far as its demonstration",
             ),
             (
-                self.end / (END_LIMIT + self.spread),
+                self.end / self.end_limit,
                 f"is {self.end:.3g} of the size from the end when the demonstration ends",
             ),
             (
                 self.nearby / NEARBY_LIMIT,
                 f"misses by {self.nearby:.3g} of the size from a start beside the demonstrated one",
+            ),
+            (
+                self.command / COMMAND_LIMIT,
+                f"moves {self.command:.3g} times as fast as shown from where it was shown to begin or from beside it",
             ),
             (
                 self.fastest / SPEED_LIMIT,
@@ -240,6 +256,13 @@ def measure(ds: System, shown: Sequence[Excerpt]) -> Fidelity:
     figures = {name: float(np.max([one[name] for one in every])) for name in every[0]}
     ratios = [one["length_ratio"] for one in every]
     figures["length_ratio"] = max(ratios, key=lambda ratio: abs(math.log(ratio)) if ratio > 0 else math.inf)
+    if len(shown) > 1:
+        shares = draw.dirichlet(np.ones(len(shown)), NEARBY_STARTS)
+        between = torch.from_numpy(shares @ np.stack([path[0] for path in paths])).to(ds.attractor)
+        times = torch.linspace(0, duration, EXCERPT_POINTS, dtype=torch.float64).to(ds.attractor.device)
+        figures["command"] = float(np.max([figures["command"], _largest_speed(ds, ds.rollout(between, times))]))
+    for name in ("command", "fastest"):
+        figures[name] /= max(one.fastest for one in shown)
     goals = np.stack([path[-1] for path in paths])
     spread = np.linalg.norm(goals - goals.mean(0), axis=1) / [extent(path) for path in paths]
     return Fidelity(**figures, spread=float(spread.max()), shown=tuple(shown))
@@ -264,6 +287,10 @@ def _worst_coordinate(motion: Array, path: Array, still: float) -> float:
     return float(np.max(missed, initial=0.0))
 
 
+def _largest_speed(ds: System, points: Tensor) -> float:
+    return float(torch.linalg.vector_norm(ds(points), dim=-1).max())
+
+
 def _measure(
     ds: System, one: Excerpt, path: Array, duration: float, pace: float, around: Array, ball: Array
 ) -> dict[str, float]:
@@ -280,13 +307,13 @@ def _measure(
     energy, error = ds.lyapunov(moved[0]), ds.latent_error(starts[0], times)
     missed = [dtw(motion, path) / count / size for motion in motions]
     beside = path[np.arange(len(ball)) * count // len(ball)] + BESIDE_PATH * size * ball
-    velocity = ds(torch.from_numpy(np.concatenate([path, beside])).to(ds.attractor))
     return {
         "miss": missed[0],
         "length_ratio": path_length_ratio(motions[0], path, one.ruler),
         "end": endpoint_error(motions[0], path) / size,
         "nearby": float(np.max(missed[1:], initial=0.0)),
-        "fastest": float(torch.linalg.vector_norm(velocity, dim=-1).max()) / one.fastest,
+        "command": _largest_speed(ds, moved),
+        "fastest": _largest_speed(ds, torch.from_numpy(np.concatenate([path, beside])).to(ds.attractor)),
         "timing": _timing_gap(motions[0], duration, path, pace * one.duration) / size,
         "coordinate": _worst_coordinate(motions[0], path, max(one.ruler, CONSTANT_WITHIN * size)),
         "rise": float(energy.diff().max() / energy[0]),

@@ -227,6 +227,15 @@ def test_converged_wants_the_goal_in_time(method):
     assert not compare({"m": method}, SPIRAL, **QUICK)["converged"].any()
 
 
+def test_of_several_goals_the_systems_own_is_to_be_reached():
+    """It is one of them or between them; one system cannot end at each."""
+    line = SPIRAL.positions
+    drift = 0.01 * torch.linspace(0, 1, len(line))[:, None]
+    shown = [Demonstration(line - side * drift, SPIRAL.dt, f"{side}") for side in (0, 1)]
+    assert compare({"between": Straight}, [shown], **QUICK)["converged"].all()
+    assert not compare({"beside": Lost}, [shown], **QUICK)["converged"].any()
+
+
 @pytest.mark.slow
 def test_processes_and_threads_give_the_serial_rows():
     methods = {**SMALL, "random": Straight, "lambda": lambda dim: Straight(dim)}

@@ -113,6 +113,7 @@ def test_limits_of_fidelity_are_the_ones_that_are_told():
         "timing": [fidelity.TIMING_LIMIT],
         "flow_gap": [fidelity.FLOW_GAP_LIMIT],
         "coordinate": [fidelity.COORDINATE_LIMIT],
+        "command": [fidelity.COMMAND_LIMIT],
         "latent_error": [fidelity.ROUNDING_LIMIT],
     }
     assert told.keys() == fidelity.Fidelity.__dataclass_fields__.keys() - {"spread", "shown"}

@@ -30,6 +30,7 @@ from latentds.fidelity import (
     MISS_LIMIT,
     MOST_EXCERPT_POINTS,
     NEARBY_LIMIT,
+    SPREAD_LIMIT,
     TIMING_LIMIT,
     Excerpt,
     Fidelity,
@@ -211,7 +212,15 @@ class Scatters(Follower):
 class Races(Follower):
     def forward(self, y):
         aside = (y[..., 1:].norm(dim=-1, keepdim=True) > 0.05).to(y)
-        return super().forward(y) * (1 + 100 * aside)
+        return super().forward(y) * (1 + 20 * aside)
+
+
+class Lunges(Follower):
+    """From within nine thousandths of a size from the path's beginning, and nowhere that is looked at beside it."""
+
+    def forward(self, y):
+        begins = ((y - y.new_tensor([1.0, 0.0, 0.0])).norm(dim=-1, keepdim=True) < 0.009).to(y)
+        return super().forward(y) * (1 + 3 * begins)
 
 
 class Rises(Follower):
@@ -239,6 +248,7 @@ PLANTED = {
     IsLate: "of the size from the end when the demonstration ends",
     Scatters: "of the size from a start beside the demonstrated one",
     Races: "times as fast as shown within 10% of the size from the path",
+    Lunges: "moves 4.02 times as fast as shown from where it was shown to begin or from beside it",
     Rises: "V rises by 0.0",
     DependsOnTheTime: "its motion begun anew half-way is another one",
     LosesX: "rounding breaks its map, encode(decode(x)) is 0.5 latent lengths from x",
@@ -513,7 +523,7 @@ def test_units_and_origin_do_not_matter(scale, shift, monkeypatch):
     here = Follower(3).fit(motion).fit_report.fidelity
     monkeypatch.setattr(Follower, "tau", moved.duration)
     there = Follower(3).fit(moved).fit_report.fidelity
-    for name in ("miss", "length_ratio", "end", "nearby", "fastest", "rise"):
+    for name in ("miss", "length_ratio", "end", "nearby", "fastest", "command", "rise"):
         assert getattr(there, name) == pytest.approx(getattr(here, name), rel=1e-6), name
 
 
@@ -537,13 +547,15 @@ def test_each_of_several_demonstrations_is_held_against_itself():
     assert not wide.follows
 
 
-def test_goals_that_differ_are_allowed_for_at_the_end_alone():
+def test_goals_that_differ_are_allowed_for_at_the_end_alone_and_not_without_bound():
     base = wavy_motion(2)
     aside = 0.2 * base.size * np.linspace(0, 1, len(base))[:, None] * np.array([0.0, 1.0])
     shown = [Demonstration(base.positions.numpy() + side * aside, base.dt) for side in (1, -1)]
     fidelity = TubeDS(2, n_layers=40, refined=False).fit(shown).fit_report.fidelity
     assert fidelity.spread == pytest.approx(0.2, rel=0.1)
-    assert END_LIMIT < fidelity.end < END_LIMIT + fidelity.spread
+    assert fidelity.end_limit == END_LIMIT + SPREAD_LIMIT < fidelity.end
+    assert any("from the end when the demonstration ends" in note for note in fidelity.notes)
+    assert END_LIMIT < replace(fidelity, spread=0.08).end_limit < END_LIMIT + SPREAD_LIMIT
     assert TubeDS(2, n_layers=40, refined=False).fit(shown[:1]).fit_report.fidelity.spread == 0
 
 
@@ -601,6 +613,7 @@ def test_figures_that_are_no_numbers_do_not_pass():
         "flow_gap",
         "timing",
         "latent_error",
+        "command",
     ):
         assert not replace(good, **{name: float("nan")}).follows
     assert isinstance(good, Fidelity)

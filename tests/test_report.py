@@ -184,7 +184,7 @@ def test_the_verdict_on_one_method_says_whether_it_follows_and_what_was_noted(se
     said = report.verdict(Comparison(noted, seven))
     assert said[0].startswith("TubeDS does not follow arm 0 as it should: ")
     assert "Noted: it rests on the way; it jumps." in said
-    assert "TubeDS: 2 of 5 motions do not arrive at the goal." in said
+    assert "TubeDS: 2 of 5 motions do not arrive at the goal within 20 durations." in said
 
 
 def test_a_method_that_was_not_tried_everywhere_is_no_winner(seven, tmp_path):
@@ -209,6 +209,10 @@ def test_certificates_are_shown_and_what_is_false_is_said(seven, tmp_path):
     false = [line["claim"] for line in lines if line["verdict"] == "falsified"]
     assert false == ["follows its demonstration"]
     text = written(tmp_path, rows.assign(**told), seven)
+    assert "A motion arrives if it comes to 1 % of the size from the system&#39;s goal within 20 durations." in text
+    late = told["certificate"].replace("follows its demonstration", "every motion arrives within 100 durations")
+    said = report.verdict(Comparison(rows.assign(certificate=late), seven))
+    assert said[-1].endswith("from farther starts than the table, whose motions arrive within 20 durations.")
     assert "Chebyshev: falsified in its certificate: follows its demonstration." in text
     page = Page(text)
     for line in lines:

@@ -173,7 +173,8 @@ def tell_fit(report: FitReport, title: str) -> None:
         for what, value, limit in (
             ("distance of the motion from the demonstration, in its sizes", fit.miss, fidelity.MISS_LIMIT),
             ("  the worst from starts beside the demonstrated one", fit.nearby, fidelity.NEARBY_LIMIT),
-            ("  of their ends when the demonstration ends", fit.end, fidelity.END_LIMIT + more),
+            ("  of their ends when the demonstration ends", fit.end, fit.end_limit),
+            ("largest speed from the shown start, over the largest shown", fit.command, fidelity.COMMAND_LIMIT),
             ("largest speed within 10 % of the size, over the largest shown", fit.fastest, fidelity.SPEED_LIMIT),
         ):
             table.add_row(what, f"{value:.3g}", f"{limit:.3g}")
@@ -421,11 +422,13 @@ def settings_of(protocol: RolloutProtocol, systems: Mapping[str, StableDS]) -> d
 
 
 def tell_rows(rows: pd.DataFrame, shown: Sequence[Any]) -> None:
-    from ..report import Comparison, percent, verdict
+    from ..report import ARRIVE, Comparison, percent, verdict
 
     comparison = Comparison(rows, shown)
     titles = "around", "± sd", "worst", "shown start", "end", "arrive", "follow", "fit [s]"
-    table = Table("method", *titles, title="Distances (exact DTW over points) in percent of the motion's size")
+    table = Table(
+        "method", *titles, title="Distances (exact DTW over points) in percent of the motion's size", caption=ARRIVE
+    )
     table.columns[0].overflow = "fold"
     for column in table.columns[1:]:
         column.justify = "right"

@@ -18,7 +18,7 @@ from ..files import atomic_write
 from .comparison import Comparison
 from .drawn import drawn
 from .measured import findings
-from .verdict import percent, verdict
+from .verdict import ARRIVE, percent, verdict
 
 try:
     from jinja2 import Environment, StrictUndefined
@@ -30,7 +30,7 @@ except ImportError as error:
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Comparison", "environment", "findings", "percent", "verdict", "write"]
+__all__ = ["ARRIVE", "Comparison", "environment", "findings", "percent", "verdict", "write"]
 
 PACKAGES = ("latentds", "torch", "numpy", "scipy", "numba", "fastdtw", "pandas", "joblib")
 
@@ -141,6 +141,7 @@ def _page(**content: Any) -> str:
     pages.filters["percent"] = percent
     page = pages.from_string((here / "page.html").read_text(encoding="utf-8"))
     return page.render(
+        arrive=ARRIVE,
         style=Markup(style),
         script=Markup(script),
         plotly=Markup(plotly),

@@ -9,8 +9,12 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from ..cell import CONVERGED_AFTER, CONVERGED_WITHIN
 from .comparison import Comparison
 
+BY_WHEN = f"within {CONVERGED_AFTER:g} durations"
+ARRIVE = f"A motion arrives if it comes to {100 * CONVERGED_WITHIN:g} % of the size from the system's goal {BY_WHEN}."
+"""What the column "arrive" counts."""
 SURE = 0.01
 """p from which on a difference between methods is called one that chance may make."""
 
@@ -79,7 +83,7 @@ def _remarks(comparison: Comparison) -> Iterator[str]:
         if line["failed"]:
             yield f"{line['method']}: {line['failed']} of {of} motions fail or diverge."
         elif arrived < of:
-            yield f"{line['method']}: {of - arrived} of {of} motions do not arrive at the goal."
+            yield f"{line['method']}: {of - arrived} of {of} motions do not arrive at the goal {BY_WHEN}."
         followed, fits = line["follows"]
         if followed < fits and len(lines) > 1:
             yield f"{line['method']} does not follow in {fits - followed} of {fits} fits, by its own measurement."
@@ -87,3 +91,5 @@ def _remarks(comparison: Comparison) -> Iterator[str]:
     for method in dict.fromkeys(method for method, _ in false):
         claims = dict.fromkeys(claim for one, claim in false if one == method)
         yield f"{method}: falsified in its certificate: {'; '.join(claims)}."
+    if any(claim.startswith("every motion arrives") for _, claim in false):
+        yield f"A certificate looks at motions from farther starts than the table, whose motions arrive {BY_WHEN}."
