@@ -28,7 +28,7 @@ from .deploy.controller import Controller
 from .deploy.tables import FieldTables, field_tables
 from .diffeomorphism import Diffeomorphism, eager_for_derivatives
 from .dynamics import Frame, LatentDynamics
-from .fidelity import EXCERPT_POINTS, ROUNDING_LIMIT, Excerpt, Fidelity, FitWarning, measure
+from .fidelity import COMMAND_LIMIT, EXCERPT_POINTS, ROUNDING_LIMIT, Excerpt, Fidelity, FitWarning, measure
 from .files import write_tensors
 from .findings import every_finding
 from .integrate import integrate
@@ -36,7 +36,7 @@ from .kernels.dispatch import no_active_transforms
 from .kernels.private import is_altered, tensors_of
 from .memo import Memo
 from .probes import restart_gap, round_trip_gap
-from .similarity import Similarity, check_rotation
+from .similarity import Similarity, check_rotation, turned_onto
 
 FORMAT = 4
 """Of the files of systems; raised when they change so that another latentds would misread them."""
@@ -248,12 +248,61 @@ class StableDS(nn.Module, ABC):
         return Controller(self, max_speed=max_speed)
 
     def with_goal(self, goal: Any) -> MovedDS:
-        """The same motion to another goal, shifted as a whole.
+        """The same motion to another goal, shifted as a whole: its start has moved, too.
 
         Args:
             goal: (n,) finite. A gradient of what the new system computes reaches it.
+
+        Warns:
+            UserWarning: if a robot that stands where it was shown to begin would lunge, with the figure. Not where a
+                gradient or a transform passes. What keeps the start is :meth:`with_start_and_goal`.
         """
-        return self._moved(_vector(goal, self.attractor, "goal"))
+        moved, shown = self._moved(_vector(goal, self.attractor, "goal")), self.excerpts()
+        if shown and no_active_transforms() and not moved.attractor.requires_grad:
+            begin = torch.tensor([one.path[0] for one in shown], dtype=torch.float64).to(self.attractor)
+            with torch.no_grad():
+                fastest = torch.linalg.vector_norm(moved(begin), dim=-1).max()
+            command = float(fastest) / max(one.fastest for one in shown)
+            if not command <= COMMAND_LIMIT:
+                warnings.warn(
+                    f"with_goal: from where it was shown to begin, the first command is now {command:.3g} times the "
+                    "largest speed shown, as the start has moved with the goal; with_start_and_goal(start, goal) "
+                    "keeps it, controller(max_speed=) and Controller.approach hold back",
+                    stacklevel=2,
+                )
+        return moved
+
+    def with_start_and_goal(self, start: Any, goal: Any) -> MovedDS:
+        """The same motion between another start and goal: turned the shortest way, scaled and shifted, its shape kept.
+
+        It is what is meant if the object has moved and the robot has not. Its duration stays, so that speeds grow with
+        its length. Turning mixes the coordinates, which should have one unit.
+
+        Args:
+            start: (n,) finite, where the shown start, of several the mean, comes to lie.
+            goal: (n,) finite, another point. A gradient of what the new system computes reaches both.
+
+        Raises:
+            ValueError: if the system keeps no demonstration, if start and goal are one point, or if their way is the
+                opposite of the shown one in 3 or more dimensions, where no turn is the shortest.
+
+        Warns:
+            UserWarning: if the motion becomes more than ``COMMAND_LIMIT`` times as fast, with the figure. Not where a
+                gradient or a transform passes.
+        """
+        shown = self.excerpts()
+        if not shown:
+            raise ValueError("ds: expected a system that keeps what it was shown, got one that was not fitted")
+        begin, end = _vector(start, self.attractor, "start"), _vector(goal, self.attractor, "goal")
+        begun = torch.tensor([one.path[0] for one in shown], dtype=torch.float64).mean(0).to(self.attractor)
+        rotation, scale = turned_onto(self.attractor - begun, end - begin)
+        if no_active_transforms() and not scale.requires_grad and not float(scale) <= COMMAND_LIMIT:
+            warnings.warn(
+                f"with_start_and_goal: the motion is now {float(scale):.3g} times as long in the same time, and as "
+                "fast: slowed(factor) gives it more, controller(max_speed=) holds back",
+                stacklevel=2,
+            )
+        return self._moved(end, rotation=rotation, scale=scale)
 
     def transformed(self, *, rotation: Any = None, translation: Any = None, scale: float = 1.0) -> MovedDS:
         """The same motion under y ↦ s R y + t, about the origin.
@@ -279,7 +328,7 @@ class StableDS(nn.Module, ABC):
         moved = MovedDS(self)
         moved.register_buffer("attractor", attractor.clone())
         for name, value in change.items():
-            moved.similarity.get_buffer(name).copy_(torch.as_tensor(value))
+            moved.similarity.register_buffer(name, torch.as_tensor(value).to(attractor))
         return moved
 
     def excerpts(self) -> tuple[Excerpt, ...]:

@@ -16,9 +16,12 @@ from .arguments import positive, real_array
 from .demonstration import Demonstration
 from .deploy.tables import FieldTables
 from .fidelity import Excerpt
+from .kernels.dispatch import no_active_transforms
 
 ORTHOGONAL = 1e-5
 """How far RᵀR of a rotation may be from the identity: as far as rounding to float32 leaves it, or typing it in."""
+OPPOSITE = 1e-9
+"""Directions whose cosine is so near to -1 are opposite: which turn is the shortest is then for rounding to say."""
 
 
 class Similarity(nn.Module):
@@ -97,6 +100,34 @@ class Similarity(nn.Module):
 def _turned(v: Tensor, rotation: Tensor) -> Tensor:
     """R v, not as a matrix product, which torch.autocast would take in half precision: (..., n) -> (..., n)."""
     return (rotation * v.unsqueeze(-2)).sum(-1)
+
+
+def turned_onto(before: Tensor, after: Tensor) -> tuple[Tensor, Tensor]:
+    """The rotation R by the least angle, (n, n), and the scale s, (), for which s R ``before`` = ``after``, both (n,).
+
+    In float64 on the CPU. R = I + K + K²/(1 + aᵀb), K = baᵀ - abᵀ, for the directions a and b.
+
+    Raises:
+        ValueError: if one is 0, or if they are opposite in 3 or more dimensions, where many turns are as short.
+    """
+    ways = torch.stack([before, after]).to("cpu", torch.float64)
+    lengths = torch.linalg.vector_norm(ways, dim=-1)
+    a, b = ways / lengths[:, None]
+    seen, dim = no_active_transforms(), len(before)
+    if seen and not bool(lengths.min() > 0):
+        raise ValueError("start, goal: expected two points, got one")
+    together = (a * b).sum()
+    eye = torch.eye(dim, dtype=torch.float64)
+    if seen and float(together) < OPPOSITE - 1:
+        if dim > 2:
+            raise ValueError(
+                "start, goal: expected a way that is not the opposite of the shown one, as no turn to it is the "
+                "shortest; say which: transformed(rotation=, translation=, scale=)"
+            )
+        return -eye, lengths[1] / lengths[0]
+    across = b[:, None] * a - a[:, None] * b
+    twice = (across[:, :, None] * across).sum(1)
+    return eye + across + twice / (1 + together), lengths[1] / lengths[0]
 
 
 def check_rotation(rotation: Any, dim: int) -> Tensor:

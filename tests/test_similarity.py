@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ import torch
 
 import latentds
 from baselines import FDM, SDSEF
-from latentds import ChebyshevDS, Demonstration, TubeDS, certify
+from latentds import ChebyshevDS, Demonstration, TubeDS, certify, datasets
 from latentds.base import MovedDS
 from latentds.fidelity import Excerpt
 from latentds.testing import parametrize_stable_ds, wavy_motion
@@ -104,6 +105,87 @@ def test_the_system_inside_is_the_same_and_is_trained(fitted):
         assert moved(torch.tensor([1.0, 2.0])).abs().max() < 1e-9
     assert not moved.fit_report_is_current
     assert moved.fit_report is fitted.fit_report
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 7])
+def test_the_same_shape_between_another_start_and_goal(dim, draw):
+    ds = FDM(dim, n_layers=12).fit(wavy_motion(dim))
+    begun, ended = ds.start, ds.attractor
+    begin, end = torch.randn(2, dim, generator=draw, dtype=F64)
+    end = begin + (end - begin) * (ended - begun).norm() / (end - begin).norm() * 1.5
+    moved, times = ds.with_start_and_goal(begin, end), torch.linspace(0, 2, 50, dtype=F64)
+    with torch.no_grad():
+        there, here = moved.rollout(begin, times), ds.rollout(begun, times)
+    torch.testing.assert_close(torch.cdist(there, there), 1.5 * torch.cdist(here, here))  # its shape
+    torch.testing.assert_close(moved.attractor, end, rtol=0, atol=0)
+    rotation, a, b = (
+        moved.similarity.rotation,
+        (ended - begun) / (ended - begun).norm(),
+        (end - begin) / (end - begin).norm(),
+    )
+    torch.testing.assert_close(rotation @ a, b)
+    plane = torch.linalg.qr(torch.stack([a, b], dim=1))[0]
+    aside = torch.randn(dim, generator=draw, dtype=F64)
+    aside -= plane @ (plane.T @ aside)
+    torch.testing.assert_close(rotation @ aside, aside)  # what is across both is left alone: no shorter turn
+    same = ds.with_start_and_goal(begun, ended)
+    torch.testing.assert_close(same.similarity.rotation, torch.eye(dim, dtype=F64))
+    twice = moved.slowed(2.0).with_start_and_goal(begun, ended)
+    torch.testing.assert_close(twice(begin), ds(begin) / 2)
+
+
+def test_a_way_back_has_one_turn_in_the_plane_and_is_asked_about_in_space():
+    for dim in (1, 2):
+        ds = FDM(dim, n_layers=12).fit(wavy_motion(dim))
+        back = ds.with_start_and_goal(ds.attractor, ds.start)
+        torch.testing.assert_close(back.similarity.rotation, -torch.eye(dim, dtype=F64))
+    ds = FDM(3, n_layers=12).fit(wavy_motion(3)).float()
+    with pytest.raises(ValueError, match=r"^start, goal: expected a way that is not the opposite .*transformed"):
+        ds.with_start_and_goal(ds.attractor, ds.start)
+    with pytest.raises(ValueError, match=r"^start, goal: expected two points, got one"):
+        ds.with_start_and_goal(ds.attractor, ds.attractor)
+    with pytest.raises(ValueError, match=r"^ds: expected a system that keeps what it was shown"):
+        FDM(3).with_start_and_goal([0, 0, 0], [1, 1, 1])
+    with pytest.raises(ValueError, match=r"^start: expected \(3,\) finite numbers"):
+        ds.with_start_and_goal([0, 0], [1, 1, 1])
+
+
+def test_gradients_and_batches_reach_start_and_goal(fitted, draw):
+    times = torch.linspace(0, 1, 3, dtype=F64)
+
+    def midway(ends):
+        return fitted.with_start_and_goal(*ends).rollout(ends[0], times)[1]
+
+    ends = torch.tensor([[0.3, 2.0], [1.0, -1.0]], dtype=F64, requires_grad=True)
+    assert torch.autograd.gradcheck(midway, ends, atol=1e-4, rtol=1e-3)
+    if isinstance(fitted, FDM):
+        several = torch.randn(4, 2, 2, generator=draw, dtype=F64)
+        with torch.no_grad():
+            torch.testing.assert_close(torch.func.vmap(midway)(several), torch.stack([midway(one) for one in several]))
+
+
+def test_a_robot_that_would_lunge_is_told_of():
+    shown = datasets.unstable_spiral(1, n_points=200)
+    ds = TubeDS(3, n_layers=50, refined=False).fit(shown)
+    goal = shown.goal + torch.tensor([0.2, 0.0, -0.1])
+    with pytest.warns(
+        UserWarning, match=r"with_goal: .*the first command is now (.*) times .* with_start_and_goal"
+    ) as told:
+        moved = ds.with_goal(goal)
+    with torch.no_grad():
+        lunge = float(moved(shown.start).norm() / shown.velocities.norm(dim=-1).max())
+    assert f"now {lunge:.3g} times" in str(told[0].message)
+    assert told[0].filename == __file__
+    with pytest.warns(UserWarning, match=r"with_start_and_goal: the motion is now 3 times as long .* slowed"):
+        ds.with_start_and_goal(shown.goal + 3 * (shown.start - shown.goal), shown.goal)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        kept = ds.with_start_and_goal(shown.start, goal)
+        ds.with_goal(shown.goal + 0.001)
+        ds.with_goal(goal.clone().requires_grad_())
+        TubeDS(3).with_goal(goal)  # nothing was shown to it
+    with torch.no_grad():
+        assert kept(shown.start).norm() < 1.2 * ds(shown.start).norm()
 
 
 def test_gradients_reach_the_goal(fitted):
