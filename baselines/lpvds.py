@@ -140,6 +140,7 @@ def _clustered(points: Array, velocities: Array, most: int, seed: int) -> tuple[
         mixture = scikit_learn("mixture").BayesianGaussianMixture(
             n_components=most,
             weight_concentration_prior=1 / most,
+            covariance_prior=np.cov(samples.T) + LEAST_VARIANCE * np.eye(2 * n),  # a motion may lie in a plane
             reg_covar=LEAST_VARIANCE,
             max_iter=300,
             random_state=seed,

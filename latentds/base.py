@@ -338,8 +338,8 @@ class StableDS(nn.Module, ABC):
         return () if fidelity is None else fidelity.shown
 
     def surroundings(self, ball: Tensor) -> Tensor | None:
-        """Where the motion was shown: points (m, n) for those of a unit ball, of which 0 is the attractor and the start
-        lies at distance 1. None if the system does not know."""
+        """Where the system's own space says that the motion was shown: points (m, n) for those of a unit ball, of which
+        0 is the attractor and the start lies at distance 1. None for a system without such a space."""
         return None
 
     def tables(self) -> FieldTables | None:

@@ -167,7 +167,7 @@ def _run(
     store: str | os.PathLike[str] | None,
 ) -> Iterator[Outcome]:
     with (
-        _bar(len(cells)) if progress else nullcontext(lambda outcome: None) as advance,
+        _bar(cells) if progress else nullcontext(lambda outcome: None) as advance,
         nullcontext() if store is None else CellStore(store) as finished,
     ):
         keys = {} if finished is None else _keys(cells, protocol)
@@ -230,15 +230,29 @@ def _key(cell: Cell, protocol: RolloutProtocol) -> str | None:
 
 
 @contextmanager
-def _bar(total: int) -> Iterator[Callable[[Outcome], None]]:
+def _bar(cells: Sequence[Cell]) -> Iterator[Callable[[Outcome], None]]:
+    """A function to call with each outcome; the bar names what is still awaited."""
     bars = _studies("rich.progress")
     columns = (
         bars.TextColumn("{task.description}"), bars.BarColumn(), bars.MofNCompleteColumn(),
         bars.TimeElapsedColumn(), bars.TextColumn("left"), bars.TimeRemainingColumn(),
     )  # fmt: skip
     with bars.Progress(*columns) as bar:
-        task = bar.add_task("fitting …", total=total)
-        yield lambda done: bar.update(task, advance=1, description=f"{done.method} · {done.demonstration}")
+        awaited = {cell.name: f"{cell.method} · {cell.demonstration}" for cell in cells}
+        task = bar.add_task("", total=len(cells))
+
+        def advance(done: Outcome | None) -> None:
+            told = ""
+            if done is not None:
+                told = f"fitted {awaited.pop(done.name)}"
+                bar.advance(task)
+            if awaited:
+                more = f" and {len(awaited) - 2} more" if len(awaited) > 2 else ""
+                told = f"fitting {', '.join([*awaited.values()][:2])}{more}"
+            bar.update(task, description=told)
+
+        advance(None)
+        yield advance
 
 
 def _motions(demonstrations: Any, judged_by: Any) -> list[tuple[tuple[Demonstration, ...], ...]]:

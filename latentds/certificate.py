@@ -103,8 +103,8 @@ def certify(ds: StableDS, region: Any = None, *, n_samples: int = 1000, seed: in
     Args:
         ds: any system, fitted or not; it is left as it is.
         region: (2, n) lowest and highest corner of a box, in the units of the demonstration. By default one around the
-            image of the latent ball that the demonstration spans; needed for a system without
-            :meth:`~latentds.StableDS.surroundings`.
+            image of the latent ball that the demonstration spans, of a system without
+            :meth:`~latentds.StableDS.surroundings` around what it was shown; needed if it was shown nothing.
         n_samples: points to sample, >= 10. The costlier searches try fewer.
         seed: of the samples, >= 0.
 
@@ -441,18 +441,14 @@ def _region(ds: StableDS, region: Any, generator: torch.Generator) -> Tensor:
     radii = torch.linspace(0.1, 1, 256, dtype=torch.float64).unsqueeze(-1)
     with torch.no_grad():
         around = ds.surroundings((radii * directions).to(ds.attractor))
-    if around is None:
-        raise ValueError(f"region: expected (2, {ds.dim}) corners, as {type(ds).__name__} implies none, got None")
-    points = torch.cat([around, ds.attractor.unsqueeze(0)]).detach().cpu().double()
+    places = [ds.attractor.unsqueeze(0)] if around is None else [around, ds.attractor.unsqueeze(0)]
+    points = torch.cat(places).detach().cpu().double()
     points = points[torch.isfinite(points).all(-1)]
-    if len(points) <= 1:  # a system with NaN: where it was shown, it is to be found out
-        points = torch.tensor(
-            [row for one in ds.excerpts() for row in one.path] or points.tolist(), dtype=torch.float64
-        )
+    if len(points) <= 1:  # no latent space, or one with NaN: where it was shown, it is to be found out
+        rows = [row for one in ds.excerpts() for row in one.path]
+        points = torch.cat([points, torch.tensor(rows, dtype=torch.float64).reshape(-1, ds.dim)])
     if not bool((points != points[:1]).any()):
-        raise ValueError(
-            f"region: expected (2, {ds.dim}) corners, as the latent ball of {type(ds).__name__} implies none, got None"
-        )
+        raise ValueError(f"region: expected (2, {ds.dim}) corners, as {type(ds).__name__} implies none, got None")
     low, high = points.amin(0), points.amax(0)
     margin = (0.25 * (high - low)).clamp(min=0.01 * float((high - low).max()))
     return torch.stack([low - margin, high + margin])

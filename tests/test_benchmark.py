@@ -4,6 +4,7 @@ import ctypes
 import math
 import os
 import signal
+import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
 
@@ -65,6 +66,12 @@ class Lost(Straight):
         learned = super()._learn(shown, progress)
         self.attractor += 0.01
         return learned
+
+
+class Naps(Straight):
+    def _learn(self, shown, progress):
+        time.sleep(0.3)
+        return super()._learn(shown, progress)
 
 
 class Slow(Straight):
@@ -248,12 +255,15 @@ def test_processes_and_threads_give_the_serial_rows():
     assert serial.equals(processes)
 
 
-def test_progress_names_method_and_demonstration(capsys):
+def test_progress_names_what_is_awaited(capsys, monkeypatch):
     rows = compare({"Straight": Straight}, SPIRAL, progress=True, **QUICK)
     shown = capsys.readouterr().out
     assert len(rows) == 4
-    assert "Straight · unstable c=1" in shown
+    assert "fitted Straight · unstable c=1" in shown
     assert "1/1" in shown
+    monkeypatch.setenv("FORCE_COLOR", "1")  # as on a terminal, where it is drawn ten times a second
+    compare(dict.fromkeys("abc", Naps), SPIRAL, progress=True, **QUICK)
+    assert "fitting a · unstable c=1, b · unstable c=1 and 1 more" in capsys.readouterr().out
 
 
 def test_settings_may_change_with_the_demonstration():

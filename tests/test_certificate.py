@@ -410,7 +410,7 @@ def test_a_region_that_nothing_spans_is_asked_for(fitted):
     assert not certify(ds, n_samples=20).holds  # looked at where it was shown
     ds = TubeDS(2)
     ds.start.fill_(math.nan)
-    with pytest.raises(ValueError, match=r"region: expected .* corners, as the latent ball of \w+ implies none"):
+    with pytest.raises(ValueError, match=r"region: expected .* corners, as \w+ implies none"):
         certify(ds)
     assert not certify(ds, [[-2, -2], [2, 2]], n_samples=20).holds
 

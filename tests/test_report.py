@@ -165,7 +165,7 @@ def test_the_verdict_says_whether_chance_may_make_the_difference(seven):
         p = stats.ttest_rel(*(rows[rows["method"] == one]["dtw_per_point"][1:] for one in (best, second))).pvalue
         assert (p < 0.01) == sure
         said = report.verdict(found)[0]
-        assert said.startswith(f"{best} follows arm 0 best")
+        assert said.startswith(f"{best} stays nearest to arm 0")
         assert f"before {second}" in said
         assert f"p = {p:.1g}, paired t-test over the 8 starts" in said
         assert ("chance may make" in said) == (not sure)
@@ -212,7 +212,7 @@ def test_certificates_are_shown_and_what_is_false_is_said(seven, tmp_path):
     assert "A motion arrives if it comes to 1 % of the size from the system&#39;s goal within 20 durations." in text
     late = told["certificate"].replace("follows its demonstration", "every motion arrives within 100 durations")
     said = report.verdict(Comparison(rows.assign(certificate=late), seven))
-    assert said[-1].endswith("from farther starts than the table, whose motions arrive within 20 durations.")
+    assert said[-1].startswith("Chebyshev: all 5 motions arrive, but not all from farther off")
     assert "Chebyshev: falsified in its certificate: follows its demonstration." in text
     page = Page(text)
     for line in lines:

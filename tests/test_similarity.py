@@ -299,14 +299,20 @@ def test_certified_where_the_motion_is_shown(fitted):
     assert "layer" in proven[0] or "coupling" in proven[0]
 
 
-def test_one_without_surroundings_must_be_told_where(fitted):
+def test_one_without_surroundings_is_searched_where_it_was_shown(fitted):
     class Bare(type(fitted)):
         def surroundings(self, ball):
             return None
 
     fitted.__class__ = Bare
+    shift = torch.tensor([1.0, 1.0], dtype=F64)
+    low, high = np.array(certify(fitted.with_goal(fitted.attractor + shift), n_samples=20).region)
+    path = np.array(fitted.excerpts()[0].path) + 1
+    np.testing.assert_allclose(low, path.min(0) - np.ptp(path, axis=0) / 4)
+    np.testing.assert_allclose(high, path.max(0) + np.ptp(path, axis=0) / 4)
+    fitted.fit_report = None
     with pytest.raises(ValueError, match="region: expected"):
-        certify(fitted.with_goal([1.0, 1.0]))
+        certify(fitted)
 
 
 @pytest.mark.parametrize("kind", ["FDM", "TubeDS"])

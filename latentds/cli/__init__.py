@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+import rich
 import torch
 import typer
 from rich.table import Table
@@ -49,6 +50,7 @@ class Group(TyperGroup):
     """Errors that the user can mend become one line on stderr, and so do warnings; a traceback is a bug of ours."""
 
     def invoke(self, ctx: Any) -> Any:
+        rich.reconfigure(stderr=True)  # bars, which all draw on rich's own console, so that one may hold another
         with warnings.catch_warnings():
             warnings.simplefilter("default")
             warnings.showwarning = lambda message, *_: say(f"note: {message}", "yellow")  # type: ignore[assignment]
@@ -329,7 +331,7 @@ def compare(
     """Compare methods on recordings, each a motion of its own: who follows best, from the same starts.
 
     \b
-    latentds compare mine.csv                  every method that is installed
+    latentds compare mine.csv                  every method that is installed, in minutes
     latentds compare mine.csv --method TubeDS --method FDM,n_layers=200
     latentds compare one.csv two.csv --report report.html
     latentds compare mine.csv --method TubeDS --method my_package.motions:MyDS

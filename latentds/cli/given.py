@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import difflib
 import importlib.metadata
 import inspect
 import math
@@ -134,6 +135,18 @@ def known_methods() -> dict[str, Any]:
     return {"TubeDS": TubeDS, "Chebyshev": ChebyshevDS} | plugged
 
 
+def _found(name: str, known: dict[str, Any]) -> str | None:
+    """The label that a method is known by under this name: its own, its class's, in upper case or lower."""
+    for label, made in known.items():
+        if _plain(name) in (_plain(label), _plain(getattr(made, "attr", getattr(made, "__name__", "")))):
+            return label
+    return None
+
+
+def _plain(name: str) -> str:
+    return name.removeprefix("latentds.").removeprefix("baselines.").replace("-", "").lower()
+
+
 def method_of(text: str) -> Factory:
     """The callable(dim) that ``NAME[,setting=value …]`` stands for.
 
@@ -143,8 +156,8 @@ def method_of(text: str) -> Factory:
     """
     name, *assignments = text.split(",")
     known = known_methods()
-    if name in known:
-        made = known[name]
+    if (label := _found(name, known)) is not None:
+        made = known[label]
         made = made.load() if hasattr(made, "load") else made
     elif ":" in name:
         try:
@@ -152,7 +165,9 @@ def method_of(text: str) -> Factory:
         except (AttributeError, ValueError) as error:
             raise ValueError(f"method: expected module:Class, got {name!r}: {error}") from None
     else:
-        raise ValueError(f"method: expected one of {', '.join(known)}, or module:Class, got {name!r}")
+        near = difflib.get_close_matches(_plain(name), {_plain(label): label for label in known}, 1)
+        meant = "".join(f"; did you mean {label}?" for label in known if _plain(label) in near)
+        raise ValueError(f"method: expected one of {', '.join(known)}, or module:Class, got {name!r}{meant}")
     if not (inspect.isclass(made) and issubclass(made, StableDS)):
         raise ValueError(f"method: expected a StableDS, got {name!r}")
     wanted = [setting for setting in inspect.signature(made).parameters if setting != "dim"]
@@ -160,7 +175,10 @@ def method_of(text: str) -> Factory:
     for part in assignments:
         setting, equals, value = part.partition("=")
         if not equals or setting not in wanted:
-            raise ValueError(f"method: expected settings of {name} as NAME=VALUE, of {', '.join(wanted)}, got {part!r}")
+            meant = "".join(f"; did you mean {one}?" for one in difflib.get_close_matches(setting, wanted, 1))
+            raise ValueError(
+                f"method: expected settings of {name} as NAME=VALUE, of {', '.join(wanted)}, got {part!r}{meant}"
+            )
         settings[setting] = _literal(value)
     return partial(made, **settings)
 
@@ -199,13 +217,13 @@ def loaded(path: Path, method: str = "") -> tuple[StableDS, list[Demonstration]]
 
 
 def fitted(ds: StableDS, shown: list[Demonstration]) -> StableDS:
-    """Fit, and show for how long already."""
+    """Fit, and show for how long already, and the method's own bar, if it has one."""
     what = shown[0].name if len(shown) == 1 else f"{len(shown)} demonstrations"
     columns = SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn()
-    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    bar = Progress(*columns, transient=True)
     with interrupts_kept(), bar:
         bar.add_task(f"fitting {type(ds).__name__} to {what}")
-        return ds.fit(shown[0] if len(shown) == 1 else shown)
+        return ds.fit(shown[0] if len(shown) == 1 else shown, progress=sys.stderr.isatty())
 
 
 def system_of(paths: list[Path], options: RecordingOptions, method: str) -> tuple[StableDS, list[Demonstration]]:

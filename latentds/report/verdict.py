@@ -23,7 +23,7 @@ def percent(share: float) -> str:
     """Two figures; a dash for none."""
     if not math.isfinite(share):
         return "—"
-    return f"{100 * share:.2g} %" if 100 * share < 99.5 else f"{100 * share:.0f} %"
+    return f"{100 * share:.0f} %" if 0.995 <= share < 100 else f"{100 * share:.2g} %"
 
 
 def verdict(comparison: Comparison) -> list[str]:
@@ -40,7 +40,7 @@ def _best(comparison: Comparison) -> str:
         return f"No method moves through all of {what}: rollouts fail or diverge."
     if others:
         return (
-            f"{best['method']} follows {what} best: {percent(best['level'])} of the motion's size away on the mean "
+            f"{best['method']} stays nearest to {what}: {percent(best['level'])} of the motion's size away on the mean "
             f"{where}, before {others[0]['method']} with {percent(others[0]['level'])}"
             f"{_certainty(best, others[0], comparison)}."
         )
@@ -91,5 +91,8 @@ def _remarks(comparison: Comparison) -> Iterator[str]:
     for method in dict.fromkeys(method for method, _ in false):
         claims = dict.fromkeys(claim for one, claim in false if one == method)
         yield f"{method}: falsified in its certificate: {'; '.join(claims)}."
-    if any(claim.startswith("every motion arrives") for _, claim in false):
-        yield f"A certificate looks at motions from farther starts than the table, whose motions arrive {BY_WHEN}."
+    late = {method for method, claim in false if claim.startswith("every motion arrives")}
+    for line in lines:
+        arrived, of = line["arrives"]
+        if line["method"] in late and arrived == of:
+            yield f"{line['method']}: all {of} motions arrive, but not all from farther off, in its certificate."
