@@ -12,6 +12,7 @@ import joblib
 import numpy as np
 import pandas as pd
 import pytest
+import rich
 import torch
 from scipy import stats
 
@@ -255,14 +256,17 @@ def test_processes_and_threads_give_the_serial_rows():
     assert serial.equals(processes)
 
 
-def test_progress_names_what_is_awaited(capsys, monkeypatch):
+def test_progress_names_what_is_awaited(capsys):
     rows = compare({"Straight": Straight}, SPIRAL, progress=True, **QUICK)
     shown = capsys.readouterr().out
     assert len(rows) == 4
     assert "fitted Straight · unstable c=1" in shown
     assert "1/1" in shown
-    monkeypatch.setenv("FORCE_COLOR", "1")  # as on a terminal, where it is drawn ten times a second
-    compare(dict.fromkeys("abc", Naps), SPIRAL, progress=True, **QUICK)
+    rich.reconfigure(force_terminal=True, width=100)  # where it is drawn ten times a second
+    try:
+        compare(dict.fromkeys("abc", Naps), SPIRAL, progress=True, **QUICK)
+    finally:
+        rich.reconfigure()
     assert "fitting a · unstable c=1, b · unstable c=1 and 1 more" in capsys.readouterr().out
 
 
