@@ -73,6 +73,18 @@ class FitReport:
     columns: tuple[str, ...] = ()
     state: str = ""
 
+    def __str__(self) -> str:
+        """A page to read: what was learned from what, whether it follows, each figure beside its limit, the notes."""
+        names = ", ".join(name for name, _ in self.learned_from[:3])
+        more = f" and {len(self.learned_from) - 3} more" if len(self.learned_from) > 3 else ""
+        layers = f"{self.n_layers} layers, " if self.n_layers else ""
+        learned = f"learned from {names or 'nothing that it keeps'}{more}: {layers}{self.seconds:.1f} s"
+        lines = [f"{learned}, mean squared error per coordinate {self.mse:.2e}"]
+        if self.fidelity is not None:
+            follows = "It follows" if self.fidelity.follows else "It does NOT follow"
+            lines += [f"{follows} what it was shown.", str(self.fidelity)]
+        return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
+
 
 @dataclass(frozen=True)
 class Learned:

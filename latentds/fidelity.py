@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -186,48 +186,49 @@ class Fidelity:
     @property
     def findings(self) -> tuple[tuple[float, str], ...]:
         """Each figure over its limit, and in words."""
-        folded = math.inf if not self.length_ratio > 0 else self.length_ratio
-        figures = (
-            (self.miss / MISS_LIMIT, f"misses its demonstration by {self.miss:.3g} of the size"),
-            (
-                max(folded / LARGEST_LENGTH_RATIO, LEAST_LENGTH_RATIO / folded),
-                f"moves {self.length_ratio:.3g} times as far as its demonstration",
-            ),
-            (
-                self.end / self.end_limit,
-                f"is {self.end:.3g} of the size from the end when the demonstration ends",
-            ),
-            (
-                self.nearby / NEARBY_LIMIT,
-                f"misses by {self.nearby:.3g} of the size from a start beside the demonstrated one",
-            ),
-            (
-                self.command / COMMAND_LIMIT,
-                f"moves {self.command:.3g} times as fast as shown from where it was shown to begin or from beside it",
-            ),
-            (
-                self.fastest / SPEED_LIMIT,
-                f"moves {self.fastest:.3g} times as fast as shown within {BESIDE_PATH:.0%} of the size from the path",
-            ),
-            (self.rise / ROUNDING_LIMIT, f"V rises by {self.rise:.3g} of itself along its motion"),
-            (
-                self.restart_gap / ROUNDING_LIMIT,
-                f"its motion begun anew half-way is another one, {self.restart_gap:.3g} sizes away",
-            ),
-            (
-                self.timing / TIMING_LIMIT,
-                f"is {self.timing:.3g} of the size from where its demonstration is at the same time, on average",
-            ),
-            (
-                self.flow_gap / FLOW_GAP_LIMIT,
-                f"its rollout is {self.flow_gap:.3g} sizes off the integral of its velocity field, which a robot runs",
-            ),
-            (
-                self.latent_error / ROUNDING_LIMIT,
-                f"rounding breaks its map, encode(decode(x)) is {self.latent_error:.3g} latent lengths from x",
-            ),
+        return tuple(
+            (math.inf if math.isnan(badness) else badness, words) for _, _, _, badness, words in self._judged()
         )
-        return tuple((math.inf if math.isnan(badness) else badness, words) for badness, words in figures)
+
+    def __str__(self) -> str:
+        """Each figure beside its limit, a line each."""
+        head = f"{'':62}{'measured':>10}{'may be':>14}"
+        return "\n".join([head, *(f"  {what:60}{value:10.3g}{limit:>14}" for what, value, limit, *_ in self._judged())])
+
+    def _judged(self) -> Iterator[tuple[str, float, str, float, str]]:
+        """Each figure: what it is, its value, what it may be, its value over that, and what a note says of it."""
+        beside = f"within {BESIDE_PATH:.0%} of the size"
+        for limit, value, what, words in (
+            (MISS_LIMIT, self.miss, "distance from the demonstration, in its sizes",
+             "misses its demonstration by {} of the size"),
+            (NEARBY_LIMIT, self.nearby, "the same, the worst from starts beside the demonstrated one",
+             "misses by {} of the size from a start beside the demonstrated one"),
+            (self.end_limit, self.end, "distance of its end from the demonstrated one, in sizes",
+             "is {} of the size from the end when the demonstration ends"),
+            (TIMING_LIMIT, self.timing, "distance at equal times, on average, in sizes",
+             "is {} of the size from where its demonstration is at the same time, on average"),
+            (COMMAND_LIMIT, self.command, "largest speed from the shown start, over the largest shown",
+             "moves {} times as fast as shown from where it was shown to begin or from beside it"),
+            (SPEED_LIMIT, self.fastest, f"largest speed {beside} of the path, over that",
+             f"moves {{}} times as fast as shown {beside} from the path"),
+            (ROUNDING_LIMIT, self.rise, "largest rise of V along the motion, over V",
+             "V rises by {} of itself along its motion"),
+            (ROUNDING_LIMIT, self.restart_gap, "the motion begun anew half-way is away, in sizes",
+             "its motion begun anew half-way is another one, {} sizes away"),
+            (FLOW_GAP_LIMIT, self.flow_gap, "its rollout from the integral of the field, in sizes",
+             "its rollout is {} sizes off the integral of its velocity field, which a robot runs"),
+            (ROUNDING_LIMIT, self.latent_error, "encode(decode(x)) from x, in latent lengths",
+             "rounding breaks its map, encode(decode(x)) is {} latent lengths from x"),
+        ):  # fmt: skip
+            yield what, value, f"{limit:.3g}", value / limit, words.format(f"{value:.3g}")
+        folded = math.inf if not self.length_ratio > 0 else self.length_ratio
+        yield (
+            "its length over that of the demonstration",
+            self.length_ratio,
+            f"{LEAST_LENGTH_RATIO:g} to {LARGEST_LENGTH_RATIO:g}",
+            max(folded / LARGEST_LENGTH_RATIO, LEAST_LENGTH_RATIO / folded),
+            f"moves {self.length_ratio:.3g} times as far as its demonstration",
+        )
 
 
 @torch.no_grad()

@@ -1,7 +1,7 @@
 """Pictures of motions and scores. Every function returns a matplotlib Figure and leaves the backend alone.
 
 Save one with ``figure.savefig("name.png")``. A method has the same colour in every picture. ``paths`` is always
-{label: (B, T, n) rollouts}, over the demonstration's duration; NaN in them leaves a gap.
+{label: (B, T, n) rollouts}, over the demonstration's duration, of several the first one's; NaN in them leaves a gap.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ import torch
 
 from .arguments import Array, number_in, real_array
 from .base import StableDS
+from .cell import joint_name, several
+from .curves import extent
 from .demonstration import Demonstration
 
 try:
@@ -42,36 +44,41 @@ def color_of(label: str) -> str:
     return COLORS.get(label, OTHERS[crc32(label.encode()) % len(OTHERS)])
 
 
-def replications(demonstration: Demonstration, paths: Mapping[str, Any], title: str = "") -> Figure:
-    """The demonstration, and beside it a panel per method with its rollouts; n = 2 or 3.
+def replications(
+    demonstration: Demonstration | Sequence[Demonstration], paths: Mapping[str, Any], title: str = ""
+) -> Figure:
+    """The demonstration, or several of one motion, and beside it a panel per method with its rollouts; n = 2 or 3.
 
     Where rollouts leave the picture, a cube of up to 1.5 times the demonstration's size, the panel says how many.
 
     Raises:
         ValueError: for another n, or paths that do not fit the demonstration.
     """
-    if demonstration.dim not in (2, 3):
-        raise ValueError(f"demonstration: expected 2 or 3 dimensions, got {demonstration.dim}; see joints")
-    moved = _moved(paths, demonstration)
-    low, high = _box(demonstration, moved)
+    every = several(demonstration, "demonstration")
+    first = every[0]
+    if first.dim not in (2, 3):
+        raise ValueError(f"demonstration: expected 2 or 3 dimensions, got {first.dim}; see joints")
+    moved = _moved(paths, first)
+    low, high = _box(every, moved)
     figure = Figure(figsize=(3.3 * (len(moved) + 1), 3.9), dpi=DPI, layout="constrained")
-    figure.suptitle(title or demonstration.name, fontweight="bold")
-    solid = {"projection": "3d"} if demonstration.dim == 3 else {}
-    nothing = np.empty((0, 1, demonstration.dim))
+    figure.suptitle(title or joint_name(every), fontweight="bold")
+    solid = {"projection": "3d"} if first.dim == 3 else {}
+    nothing = np.empty((0, 1, first.dim))
     for i, (label, batch) in enumerate([("demonstration", nothing), *moved.items()]):
         axes = figure.add_subplot(1, len(moved) + 1, i + 1, **solid)
         inside = np.all((batch >= low) & (batch <= high), axis=2)
         for path, seen in zip(batch, inside, strict=True):
             axes.plot(*np.where(seen[:, None], path, np.nan).T, color=color_of(label), lw=0.8, alpha=0.55)
-        shown = demonstration.positions.numpy()
-        axes.plot(*shown.T, color=SHOWN, lw=0.9 if i else 1.6, ls="--" if i else "-")
-        starts = batch[:, 0] if i else shown[:1]
+        for one in every:
+            axes.plot(*one.positions.numpy().T, color=SHOWN, lw=0.9 if i else 1.6, ls="--" if i else "-")
+        starts = batch[:, 0] if i else np.stack([one.start.numpy() for one in every])
         axes.plot(*starts.T, "o", color=SHOWN, ms=2.2 if i else 3.5, label="start")
-        axes.plot(*shown[-1:].T, "*", color="#E69F00", mec=SHOWN, mew=0.6, ms=11, label="goal")
+        goals = np.stack([one.goal.numpy() for one in every])
+        axes.plot(*goals.T, "*", color="#E69F00", mec=SHOWN, mew=0.6, ms=11, label="goal")
         gone = int((~np.all(inside, axis=1)).sum())
         note = f"\n{gone} of {len(batch)} leave the picture" if gone else ""
         axes.set_title(label + note, color=color_of(label) if i else SHOWN, fontsize=11)
-        for axis, label, bounds in zip("xyz", _labels(demonstration), zip(low, high, strict=True), strict=False):
+        for axis, label, bounds in zip("xyz", _labels(first), zip(low, high, strict=True), strict=False):
             axes.set(**{f"{axis}lim": bounds, f"{axis}label": label})
             getattr(axes, f"{axis}axis").set_major_locator(MaxNLocator(4, prune="both"))
         _quiet(axes)
@@ -80,9 +87,13 @@ def replications(demonstration: Demonstration, paths: Mapping[str, Any], title: 
 
 
 def vector_field(
-    ds: StableDS, demonstration: Demonstration, paths: Any = None, label: str = "rollouts", margin: float = 0.35
+    ds: StableDS,
+    demonstration: Demonstration | Sequence[Demonstration],
+    paths: Any = None,
+    label: str = "rollouts",
+    margin: float = 0.35,
 ) -> Figure:
-    """Streamlines of a planar system with the demonstration and rollouts (B, T, 2) over them.
+    """Streamlines of a planar system with the demonstrations of one motion and rollouts (B, T, 2) over them.
 
     Args:
         ds: of dimension 2.
@@ -94,12 +105,13 @@ def vector_field(
     Raises:
         ValueError: for another n, or paths that do not fit the demonstration.
     """
-    if ds.dim != 2 or demonstration.dim != 2:
-        raise ValueError(f"ds: expected a system and a demonstration in 2-D, got {ds.dim}-D and {demonstration.dim}-D")
+    every = several(demonstration, "demonstration")
+    if ds.dim != 2 or every[0].dim != 2:
+        raise ValueError(f"ds: expected a system and a demonstration in 2-D, got {ds.dim}-D and {every[0].dim}-D")
     margin = number_in(margin, "margin", 0, math.inf, ends="[)")
-    moved = {} if paths is None else _moved({label: paths}, demonstration)
-    shown = demonstration.positions.numpy()
-    border = margin * demonstration.size
+    moved = {} if paths is None else _moved({label: paths}, every[0])
+    shown = np.concatenate([one.positions.numpy() for one in every])
+    border = margin * max(one.size for one in every)
     (left, bottom), (right, top) = shown.min(axis=0) - border, shown.max(axis=0) + border
     x, y = np.linspace(left, right, 60), np.linspace(bottom, top, 60)
     with torch.no_grad():
@@ -113,11 +125,13 @@ def vector_field(
         for i, path in enumerate(batch):
             axes.plot(*path.T, color=color_of(label), lw=1.2, alpha=0.7, label="" if i else label)
         axes.plot(*batch[:, 0].T, "o", color=color_of(label), ms=3)
-    axes.plot(*shown.T, color=SHOWN, lw=2, ls="--", label="demonstration")
-    axes.plot(*shown[0], "o", color=SHOWN, ms=6, label="start")
-    axes.plot(*shown[-1], "*", color="#E69F00", mec=SHOWN, ms=15, label="goal")
-    first, second = _labels(demonstration)
-    axes.set(xlim=(left, right), ylim=(bottom, top), xlabel=first, ylabel=second, title=demonstration.name)
+    for i, one in enumerate(every):
+        names = ("",) * 3 if i else ("demonstration", "start", "goal")
+        axes.plot(*one.positions.numpy().T, color=SHOWN, lw=2, ls="--", label=names[0])
+        axes.plot(*one.start.numpy(), "o", color=SHOWN, ms=6, label=names[1])
+        axes.plot(*one.goal.numpy(), "*", color="#E69F00", mec=SHOWN, ms=15, label=names[2])
+    first, second = _labels(every[0])
+    axes.set(xlim=(left, right), ylim=(bottom, top), xlabel=first, ylabel=second, title=joint_name(every))
     axes.set_aspect("equal")
     figure.legend(loc="outside lower center", ncols=4, fontsize=9, frameon=False)
     return figure
@@ -165,27 +179,34 @@ def dtw_bars(rows: pd.DataFrame, title: str = "") -> Figure:
     return figure
 
 
-def joints(demonstration: Demonstration, paths: Mapping[str, Any], title: str = "", unit: str = "rad") -> Figure:
-    """Every coordinate over time, one row each: the demonstration and the rollouts of each method; any n.
+def joints(
+    demonstration: Demonstration | Sequence[Demonstration],
+    paths: Mapping[str, Any],
+    title: str = "",
+    unit: str = "rad",
+) -> Figure:
+    """Every coordinate over time, one row each: the demonstrations and the rollouts of each method; any n.
 
     Raises:
         ValueError: if paths do not fit the demonstration.
     """
-    moved = _moved(paths, demonstration)
-    figure = Figure(figsize=(7.5, 1.0 + 1.25 * demonstration.dim), dpi=DPI, layout="constrained")
-    figure.suptitle(title or demonstration.name)
-    rows = figure.subplots(demonstration.dim, 1, sharex=True, squeeze=False)[:, 0]
+    every = several(demonstration, "demonstration")
+    first = every[0]
+    moved = _moved(paths, first)
+    figure = Figure(figsize=(7.5, 1.0 + 1.25 * first.dim), dpi=DPI, layout="constrained")
+    figure.suptitle(title or joint_name(every))
+    rows = figure.subplots(first.dim, 1, sharex=True, squeeze=False)[:, 0]
     for k, axes in enumerate(rows):
         # A wide pale line beneath, and dashes from the second method on: a rollout that fits hides nothing.
-        name = "" if k else "demonstration"
-        shown = demonstration.positions[:, k].numpy()
-        axes.plot(demonstration.times.numpy(), shown, color="#CCCCCC", lw=5, label=name)
+        for i, one in enumerate(every):
+            name = "" if k or i else "demonstration"
+            axes.plot(one.times.numpy(), one.positions[:, k].numpy(), color="#CCCCCC", lw=5, label=name)
         for (label, batch), dashes in zip(moved.items(), cycle(("-", "--", ":", "-.")), strict=False):
-            times = np.linspace(0, demonstration.duration, batch.shape[1])
+            times = np.linspace(0, first.duration, batch.shape[1])
             for i, path in enumerate(batch):
                 name = label if k == i == 0 else ""
                 axes.plot(times, path[:, k], dashes, color=color_of(label), lw=1.2, label=name)
-        axes.set_ylabel(f"{_labels(demonstration)[k]} [{unit}]")
+        axes.set_ylabel(f"{_labels(first)[k]} [{unit}]")
         axes.grid(color="#EEEEEE", lw=0.6)
         axes.spines[["top", "right"]].set_visible(False)
     rows[-1].set_xlabel("time [s]")
@@ -235,12 +256,12 @@ def _moved(paths: Mapping[str, Any], demonstration: Demonstration) -> dict[str, 
     return batches
 
 
-def _box(demonstration: Demonstration, moved: Mapping[str, Array]) -> tuple[Array, Array]:
-    """A cube around the demonstration, up to 1.5 times its size where rollouts ask for it."""
-    shown = demonstration.positions.numpy()
+def _box(every: Sequence[Demonstration], moved: Mapping[str, Array]) -> tuple[Array, Array]:
+    """A cube around the demonstrations, up to 1.5 times their size where rollouts ask for it."""
+    shown = np.concatenate([one.positions.numpy() for one in every])
     middle = (shown.min(axis=0) + shown.max(axis=0)) / 2
     wanted = [np.nanmax(np.abs(b - middle), initial=0.0, where=np.isfinite(b)) for b in moved.values()]
-    half = demonstration.size / 2 * 1.05
+    half = extent(shown) / 2 * 1.05
     half = min(max([half, *wanted]), 1.5 * half)
     return middle - half, middle + half
 

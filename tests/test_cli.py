@@ -132,6 +132,45 @@ def test_rollout_begins_and_lasts_as_asked(folder, system):
     torch.testing.assert_close(far.goal, latentds.load(system).attractor, atol=1e-3, rtol=0)
 
 
+def test_rollout_leads_to_another_goal_and_no_faster_than_it_may(folder, system):
+    ds = latentds.load(system)
+    start = torch.tensor(ds.excerpts()[0].path[0], dtype=torch.float64)
+    goal = ds.attractor + torch.tensor([0.1, -0.2, 0.05], dtype=torch.float64)
+    asked = "--goal=" + ",".join(map(str, goal.tolist()))
+    run("rollout", system, asked, "-o", "there.csv")
+    there = Demonstration.load("there.csv")
+    torch.testing.assert_close(there.start, start)
+    with torch.no_grad():
+        wanted = ds.with_start_and_goal(start, goal).rollout(start, there.times)
+    torch.testing.assert_close(there.positions, wanted, rtol=0, atol=1e-9)
+    fastest = float(there.velocities.norm(dim=-1).max())
+    run("rollout", system, asked, "--max-speed", fastest / 2, "--duration", 60, "-o", "slow.csv")
+    slow = Demonstration.load("slow.csv")
+    assert float(slow.velocities.norm(dim=-1).max()) < 0.501 * fastest
+    torch.testing.assert_close(slow.goal, goal, rtol=0, atol=1e-3)
+    assert float(torch.cdist(slow.positions, there.positions).amin(1).max()) < 0.02 * there.size  # the same curve
+    assert "max_speed: expected" in refused("rollout", system, "--max-speed", 0)
+    assert "goal: expected 3 numbers" in refused("rollout", system, "--goal", "1,2")
+
+
+@pytest.mark.parametrize(
+    ("name", "known"),
+    [("SEDS", "SEDS"), ("baselines.SDSEF", "SDSEF"), ("sds-ef", "SDSEF"), ("latentds.ChebyshevDS", "ChebyshevDS"),
+     ("TubeDS", "TubeDS"), ("ProMP", "ProMP")],
+)  # fmt: skip
+def test_a_method_is_known_by_its_name_in_the_readme(name, known):
+    assert given.method_of(name)(3).__class__.__name__ == known
+
+
+def test_every_baseline_is_known_and_the_nearest_name_suggested():
+    import baselines
+
+    named = {given.method_of(name).func.__name__ for name in given.known_methods()}
+    assert named == {"TubeDS", "ChebyshevDS", *baselines.__all__}
+    assert "did you mean ProMP?" in refused("fit", "mine.csv", "--method", "PrMP")
+    assert "did you mean n_layers?" in refused("fit", "mine.csv", "--method", "TubeDS,n_layer=3")
+
+
 def test_rollout_of_a_recording_fits_it_first(folder):
     run("rollout", "mine.csv", *QUICK)
     assert Demonstration.load("mine-rollout.csv").columns == ("q_hip", "q_knee", "q_foot")

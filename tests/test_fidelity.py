@@ -488,6 +488,17 @@ def test_a_report_holds_pythons_own_numbers(learned):
     assert [type(value) for value in (report.mse, report.n_layers, *report.history)] == [float, int, float]
 
 
+def test_a_report_reads_like_a_page():
+    good, bad = Follower(3).fit(decay()).fit_report, Races(3).fit(decay()).fit_report
+    lines = str(good).splitlines()
+    assert lines[0].startswith("learned from ")
+    assert lines[1] == "It follows what it was shown."
+    assert sum(line.split()[-2:] == [f"{good.fidelity.command:.3g}", "2"] for line in lines) == 1
+    assert max(map(len, lines)) < 100
+    assert "It does NOT follow what it was shown." in str(bad)
+    assert str(bad).splitlines()[-1] == f"note: {bad.notes[0]}"
+
+
 def test_a_refit_forgets_what_was_off():
     ds = Follower(3).fit(datasets.unstable_spiral(3, 200))
     assert ds.fit_report.notes

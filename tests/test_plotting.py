@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from baselines import FDM
 from latentds import ChebyshevDS, Demonstration, datasets, plotting
 from latentds.benchmark import compare
 
@@ -33,6 +35,28 @@ def test_replications_has_a_panel_per_method_with_every_rollout(make):
     assert [axes.get_title() for axes in figure.axes] == ["demonstration", "Chebyshev", "FDM"]
     colors = [line.get_color() for line in figure.axes[2].get_lines()]
     assert colors.count(plotting.color_of("FDM")) == 5
+    assert painted(figure).min() < 255
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        plotting.replications,
+        plotting.joints,
+        lambda shown, paths: plotting.vector_field(FDM(2), shown, *paths.values()),
+    ],
+    ids=["replications", "joints", "vector_field"],
+)
+def test_several_demonstrations_are_all_drawn(draw):
+    first = datasets.drawn("hook", 60)
+    shown = [first, Demonstration(1.2 * first.positions + 3, first.dt, "larger")]
+    figure = draw(shown, {"FDM": spread(first)})
+    drawn = [line.get_xydata() for axes in figure.axes for line in axes.get_lines()]
+    for one in shown:
+        ways = (one.positions, torch.stack([one.times, one.positions[:, 0]], dim=1))
+        assert any(np.array_equal(line, way) for line in drawn for way in ways), one.name
+    axes = figure.axes[0]
+    assert axes.get_xlim()[1] > 3 or axes.get_ylim()[1] > 3
     assert painted(figure).min() < 255
 
 

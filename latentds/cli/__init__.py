@@ -24,7 +24,7 @@ from rich.table import Table
 from rich.text import Text
 from typer.core import TyperGroup
 
-from .. import benchmark, fidelity, findings, recordings
+from .. import benchmark, findings, recordings
 from ..base import FitReport, StableDS
 from ..cell import Cell, Factory, RolloutProtocol, interrupts_kept, judge
 from ..certificate import certify as certified
@@ -32,6 +32,7 @@ from ..datasets import joint_motion
 from ..demonstration import Demonstration
 from ..fidelity import FitWarning
 from ..files import atomic_write
+from ..integrate import integrate
 from . import given
 from .given import RecordingOptions, reads_recordings, say, tell
 
@@ -157,38 +158,12 @@ def fit(
     if not follows:
         off = report.fidelity.notes[0] if report.fidelity else report.notes[-1]
         say(f"It does NOT follow what it was shown: it {off}.", "red")
-    tell_fit(report, type(ds).__name__)
+    tell(f"{type(ds).__name__}, {report}")
     if follows or anyway:
         ds.save(path)
     tell(f"wrote {path}" if follows or anyway else f"{path} was not written; --anyway writes it")
     if not follows:
         raise typer.Exit(DOUBTFUL)
-
-
-def tell_fit(report: FitReport, title: str) -> None:
-    table = Table("", "measured", "may be", title=f"{title}, {report.n_layers} layers, {report.seconds:.1f} s")
-    for column in table.columns[1:]:
-        column.justify = "right"
-    table.add_row("mean squared error of the fit, per coordinate", f"{report.mse:.2e}", "")
-    if (fit := report.fidelity) is not None:
-        more = fit.spread
-        for what, value, limit in (
-            ("distance of the motion from the demonstration, in its sizes", fit.miss, fidelity.MISS_LIMIT),
-            ("  the worst from starts beside the demonstrated one", fit.nearby, fidelity.NEARBY_LIMIT),
-            ("  of their ends when the demonstration ends", fit.end, fit.end_limit),
-            ("largest speed from the shown start, over the largest shown", fit.command, fidelity.COMMAND_LIMIT),
-            ("largest speed within 10 % of the size, over the largest shown", fit.fastest, fidelity.SPEED_LIMIT),
-        ):
-            table.add_row(what, f"{value:.3g}", f"{limit:.3g}")
-        span = f"{fidelity.LEAST_LENGTH_RATIO:g} to {fidelity.LARGEST_LENGTH_RATIO:g}"
-        table.add_row("length of the motion over that of the demonstration", f"{fit.length_ratio:.3g}", span)
-        if more:
-            table.add_row("distance of the demonstrations' goals from their mean", f"{more:.3g}", "")
-    tell(table)
-    for note in report.notes:
-        tell(f"note: {note}")
-    if fit is not None and fit.follows:
-        tell("It follows what it was shown.")
 
 
 @app.command()
@@ -197,6 +172,13 @@ def rollout(
     source: given.Source,
     out: given.Out = None,
     start: Annotated[str | None, typer.Option("--from", help="Where to begin: 0.1,0.2,… As shown by default.")] = None,
+    goal: Annotated[
+        str | None,
+        typer.Option(help="Where to end: 0.1,0.2,… The motion is turned and scaled to lead there.", show_default=False),
+    ] = None,
+    max_speed: Annotated[
+        float, typer.Option(help="Positions' units per second that no velocity exceeds; the curve stays.")
+    ] = math.inf,
     points: Annotated[int, typer.Option(min=2, help="Rows to write, even in time.")] = 500,
     duration: Annotated[float | None, typer.Option(help="Seconds; those of the demonstration by default.")] = None,
     method: given.Method = "TubeDS",
@@ -208,6 +190,7 @@ def rollout(
     \b
     latentds rollout mine.safetensors          writes mine-rollout.csv
     latentds rollout mine.safetensors --from 0.1,0.2,-0.3 --duration 20 -o far.csv
+    latentds rollout mine.safetensors --goal 0.4,0.1,0.3 --max-speed 0.25
     """
     path = given.target(out, source, "-rollout.csv", (".csv",))
     ds, shown = given.system_of(source, options, method)
@@ -217,9 +200,17 @@ def rollout(
     seconds = max(d.duration for d in shown) if duration is None else duration
     if not (math.isfinite(seconds) and seconds > 0):
         raise ValueError(f"duration: expected seconds > 0, got {seconds:g}")
+    if goal is not None:
+        ds = ds.with_start_and_goal(begin, given.numbers(goal, "goal", ds.dim))
     times = torch.linspace(0, seconds, points, dtype=torch.float64)
+    held = ds.controller(max_speed=max_speed)
     with torch.no_grad(), interrupts_kept():
-        motion = ds.rollout(begin.to(ds.attractor), times)
+        if math.isinf(max_speed):
+            motion = ds.rollout(begin.to(ds.attractor), times)
+        else:
+            motion = integrate(
+                lambda y: torch.from_numpy(held(y.numpy())), begin.double(), times, ds.attractor.double()
+            )
     left = float(torch.linalg.vector_norm(motion[-1] - ds.attractor))
     report = ds.fit_report
     write_motion(path, times.numpy(), motion.double().numpy(), report.columns if isinstance(report, FitReport) else ())
@@ -261,18 +252,17 @@ def plot(
     ds, shown = given.system_of(source, options, method)
     if not shown:
         raise ValueError(NOT_FITTED)
-    one = shown[0]
-    protocol = RolloutProtocol(starts, RADIUS * one.size if radius is None else radius)
-    begin = torch.cat([protocol.starts(one), *(d.start.unsqueeze(0) for d in shown[1:])])
+    protocol = RolloutProtocol(starts, RADIUS * shown[0].size if radius is None else radius)
+    begin = torch.cat([protocol.starts(shown[0]), *(d.start.unsqueeze(0) for d in shown[1:])])
     with torch.no_grad(), interrupts_kept():
-        paths = ds.rollout(begin.to(ds.attractor), protocol.times(one)).double().numpy()
+        paths = ds.rollout(begin.to(ds.attractor), protocol.times(shown[0])).double().numpy()
     label = type(ds).__name__
     if ds.dim == 2:
-        figure = plotting.vector_field(ds, one, paths, label)
+        figure = plotting.vector_field(ds, shown, paths, label)
     elif ds.dim == 3:
-        figure = plotting.replications(one, {label: paths})
+        figure = plotting.replications(shown, {label: paths})
     else:
-        figure = plotting.joints(one, {label: paths})
+        figure = plotting.joints(shown, {label: paths})
     with atomic_write(path) as file:
         figure.savefig(file, format=path.suffix[1:].lower())
     tell(f"wrote {path}: {len(begin)} motions")
