@@ -146,6 +146,34 @@ def test_meetings_are_found(kind, turns, goal):
     assert kinds(shown) == ([kind] if kind else [])
 
 
+def test_a_crossing_is_found_where_two_strands_meet():
+    angle = 2 * np.pi * (0.8 * SHARE - 0.1)
+    shown = Demonstration(np.stack([np.sin(2 * angle), np.sin(angle)], axis=1), 0.01)  # a lemniscate, open at one end
+    (found,) = shown.check()
+    assert found.kind == "crossing"
+    met = shown.positions[list(found.rows)].norm(dim=1)
+    assert float(met.max()) < 0.03  # it crosses at the origin
+    assert all("crossing" not in kinds(part) for part in shown.split_at((found.rows[0] + found.rows[1]) // 2))
+
+
+def test_a_pause_on_the_way_is_found():
+    points = smooth()
+    (found,) = named(np.concatenate([points[:200], np.repeat(points[200:201], 60, axis=0), points[200:]])).check()
+    assert (found.kind, found.unit) == ("pause", "s")
+    assert found.rows == (pytest.approx(199, abs=5), pytest.approx(260, abs=5))
+    assert found.size == pytest.approx(0.6, abs=0.1)
+
+
+def test_lengths_that_differ_are_told():
+    aside, angle = 0.1 * np.sin(np.pi * SHARE), 16 * np.pi * SHARE
+    straight, helix = (
+        Demonstration(np.stack([SHARE, radius * np.cos(angle), radius * np.sin(angle)], axis=1), 0.01)
+        for radius in (0 * aside, aside)
+    )
+    found = every_finding([straight, helix])
+    assert [item.kind for item in found] == ["lengths"]
+
+
 def test_several_that_differ_are_told():
     one = datasets.drawn("hook")
     assert every_finding([one, one]) == ()
