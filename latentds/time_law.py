@@ -8,14 +8,21 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.ndimage import gaussian_filter1d
 from torch import Tensor, nn
 
-from .arguments import positive
+from .arguments import Array, positive
 from .resizing import make_room
 from .tabulated import LawKind, LawTable, Tabulated
 
 LINEAR_BELOW = 1e-3
 """Progress below which laws turn linear, ṡ ∝ -s: a law that reaches the goal in finite time is not Lipschitz there."""
+POOLED_CELLS, POOLED_WIDTH = 60, 1.0
+"""Cells of the way in which several motions are pooled, and the standard deviation, in cells, that smooths them."""
+BEGINS_WITHIN = 0.06
+"""A motion that begins, often from rest, does not count within so much of the way where others pass."""
+SLOWEST = 1e-2
+"""Least speed of a pooled law, in ways per duration, where all rest."""
 
 
 class TimeLaw(Tabulated, nn.Module, ABC):
@@ -158,6 +165,37 @@ class PiecewiseLinearLaw(TimeLaw):
             speeds = speeds * np.exp(0.5 * nudge)
         mean = s[0] / t[-1]
         return cls(torch.from_numpy(np.append(knots, s[0] + 0.02)), torch.from_numpy(np.append(speeds, mean)))
+
+    @classmethod
+    def pooled(cls, progress: Array, times: Array) -> PiecewiseLinearLaw:
+        """The law of several motions: in each cell, the way that all pass there over the time that all spend there.
+
+        No cell is faster than the fastest was there. Where one begins and others pass, these alone count, so that who
+        starts behind does not wait where others stood. Before the hindmost start the speed turns to the mean within
+        2 % of the way.
+
+        Args:
+            progress: (K, N), of each motion from about 1 at its start to 0 at the goal.
+            times: (K, N) seconds, rising from 0.
+        """
+        s = np.minimum.accumulate(np.maximum(progress, 0), axis=1)
+        edges = np.linspace(0, max(1.0, float(s.max())), POOLED_CELLS + 1)
+        before, after, spent = s[:, :-1, None], s[:, 1:, None], np.diff(times, axis=1)[..., None]
+        passed = np.clip(before, edges[:-1], edges[1:]) - np.clip(after, edges[:-1], edges[1:])
+        whole = before - after
+        share = np.divide(passed, whole, out=np.zeros_like(passed), where=whole > 0)
+        rests = (whole <= 0) & (edges[:-1] <= before) & (before < edges[1:])  # they count where they are
+        ways, taken = passed.sum(1), (spent * (share + rests)).sum(1)  # of each motion in each cell
+        begins = edges[1:] > s[:, :1] - BEGINS_WITHIN * edges[-1]
+        others = np.where(begins, 0.0, ways).sum(0) > 0
+        counted = ~(begins & others)
+        way, took = (np.where(counted, part, 0.0).sum(0) for part in (ways, taken))
+        way, took = (gaussian_filter1d(part, POOLED_WIDTH, mode="nearest") for part in (way, took))
+        middle, seen = (edges[1:] + edges[:-1]) / 2, took > 0
+        mean = float((1 / times[:, -1]).mean())
+        speeds = np.maximum(np.interp(middle, middle[seen], way[seen] / took[seen]), SLOWEST * mean)
+        knots = np.concatenate([middle[:1] / 2, middle, edges[-1:] + 0.02])
+        return cls(torch.from_numpy(knots), torch.from_numpy(np.concatenate([speeds[:1] / 2, speeds, [mean]])))
 
     def speed(self, s: Tensor) -> Tensor:
         low, high = self._segment(torch.bucketize(s.detach(), self.knots))

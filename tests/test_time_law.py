@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import quad, solve_ivp
+from scipy.ndimage import gaussian_filter1d
 
 from latentds.dynamics import Frame, RayDynamics
 from latentds.time_law import LINEAR_BELOW, ChebyshevLaw, PiecewiseLinearLaw
@@ -186,3 +187,53 @@ def test_above_the_start_the_speed_becomes_the_mean():
     speed = law.speed(tensor([1.0, 1.02, 1.5, 10.0]))
     assert speed[0] < 0.1 * 0.25
     torch.testing.assert_close(speed[1:], torch.full((3,), 0.25, dtype=torch.float64))
+
+
+def smooth_fall(start, count=400):
+    """From ``start`` at rest to 0 at rest, evenly in time."""
+    t = np.linspace(0, 1, count)
+    return start * (1 - (10 * t**3 - 15 * t**4 + 6 * t**5))
+
+
+def pooled(*progress, duration=3.0):
+    times = np.linspace(0, duration, len(progress[0]))
+    return PiecewiseLinearLaw.pooled(np.stack(progress), np.stack([times] * len(progress)))
+
+
+def test_equal_motions_keep_their_timing_when_pooled():
+    law, times = pooled(smooth_fall(1.0), smooth_fall(1.0)), np.linspace(0, 3, 400)
+    found = law.progress_at(law.time_to_go(tensor(1.0)) - tensor(times)).numpy()
+    assert abs(found - smooth_fall(1.0)).max() < 0.05
+    np.testing.assert_allclose(float(law.speeds.max()), 1.875 / 3, rtol=0.01)
+
+
+def test_who_starts_behind_does_not_wait_where_others_stood():
+    starts = (1.25, 1.0, 0.8)
+    law = pooled(*map(smooth_fall, starts))
+    takes = law.time_to_go(tensor(starts)) - law.time_to_go(tensor(0.01))
+    assert 2.4 < float(takes[0]) < 3.3
+    slow = pooled(*map(smooth_fall, starts), duration=3000.0)
+    torch.testing.assert_close(1000 * slow.speeds, law.speeds, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_no_place_is_faster_than_what_was_shown_there(seed):
+    """However far apart they start, stop and hurry on the way."""
+    draw, times = np.random.default_rng(seed), np.linspace(0, 3, 400)
+    shown = []
+    for start in 1 + 0.3 * draw.standard_normal(4):
+        pace = np.clip(gaussian_filter1d(draw.standard_normal(400), 20), 0, None) + 1e-3
+        passed = np.concatenate([[0], np.cumsum(pace)[:-1]])
+        shown.append(max(start, 0.1) * (1 - passed / passed[-1]))
+    law = PiecewiseLinearLaw.pooled(np.stack(shown), np.stack([times] * 4))
+    for s in np.linspace(0.05, 0.9 * max(one[0] for one in shown), 50):
+        near = [abs(one[:-1] - s) < 0.06 for one in shown]  # within a few cells, over which the law is smoothed
+        there = max(
+            (float((-np.diff(one) / np.diff(times))[at].max()) for one, at in zip(shown, near, strict=True) if at.any())
+        )
+        assert float(law.speed(tensor(s))) <= 1.2 * there
+
+
+def test_motions_that_never_move_on_still_make_a_law():
+    law = pooled(np.full(100, 0.7), np.linspace(1, 0.9, 100))
+    assert float(law.speeds.min()) > 0

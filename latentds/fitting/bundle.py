@@ -1,20 +1,17 @@
-"""What lies beside a path: frames carried along it, how far a tube around it may reach, and how offsets die in it."""
+"""What lies beside a path: frames carried along it, how far a tube around it may reach."""
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
-from scipy.optimize import lsq_linear
 
 from ..arguments import Array
 from ..curves import directions_along, extent, step_lengths, transported_frames
 from .strands import Strands
 
-TUBE_RADIUS = 0.2
+TUBE_RADIUS = 0.3
 """Radius of the tube in sizes of the motion, where the path leaves room for it, …"""
 SHARE_OF_CLEARANCE, SHARE_OF_CURVATURE_RADIUS = 0.4, 0.6
 """… that is, less than such a share of the distance to the next strand, and of the radius of curvature; …"""
@@ -23,13 +20,10 @@ LEAST_RADIUS_SHARE = 0.05
 SMOOTHING_WIDTH = 0.05
 """Standard deviation, in sizes of the motion, over which a path is averaged that a whole tube lies around: hooks that
 are smaller than the tube are wide are no turns of the tube."""
-EXTENSIONS = 0.15, 0.05
+EXTENSIONS = 0.4, 0.05
 """How far the path is carried on straight before its start and beyond its goal, in sizes, where there is room."""
-BESIDE_WEIGHT = 0.3
+BESIDE_WEIGHT = 0.5
 """Weight of what lies beside the path: a point there counts as so many of the path."""
-TIMING_CELLS, FASTEST_PACE, USUAL_PACE_WEIGHT = 60, 10.0, 0.03
-"""Stretches of the way, each with a pace of its own, that :func:`timing_of` tells apart; most speed in mean speeds; and
-what a pace far from the mean costs beside the times that it explains."""
 
 
 class Bundle(NamedTuple):
@@ -119,38 +113,3 @@ def radius(path: Array, smooth: Array, wanted: float) -> Array:
 def frames_across(path: Array) -> Array:
     """Directions across a smooth path that turn no more than it does: (N, n) -> (N, n, n-1), orthonormal."""
     return transported_frames(directions_along(path))[0][:, :, 1:]
-
-
-def timing_of(progress: Array, times: Array) -> tuple[Array, Array]:
-    """When a motion passes where, such that each of several, from where it starts, keeps its own times most nearly.
-
-    Those that start behind the mean must not wait where the others stood at rest, and none may be slow where only
-    others were. The seconds that a stretch takes are found by least squares, which is a bounded linear problem.
-
-    Args:
-        progress: (K, N) where demonstrations are, 1 at the mean start and 0 at the goal.
-        times: (K, N) when, in seconds.
-
-    Returns:
-        Progress, falling from the hindmost start to 0, and seconds, rising from 0, both (m,).
-    """
-    passed = np.minimum.accumulate(np.maximum(progress, 0), axis=1)
-    edges = np.linspace(0, max(1.0, float(passed[:, 0].max())), TIMING_CELLS + 1)
-    width, low, high = edges[1], edges[:-1], edges[1:]
-    chosen = np.linspace(0, passed.shape[1] - 1, TIMING_CELLS + 1).round().astype(int)[1:]
-    starts, there = passed[:, :1, None], passed[:, chosen, None]
-    spent = (np.clip(starts, low, high) - np.clip(there, low, high)).reshape(-1, TIMING_CELLS)
-    mean = np.interp(-edges, -passed.mean(0), times.mean(0))
-    usual = np.maximum(-np.diff(mean), 1e-3 * mean[0]) / width
-    trust = USUAL_PACE_WEIGHT * width * math.sqrt(TIMING_CELLS) * np.eye(TIMING_CELLS)
-    share = 1 / math.sqrt(len(spent))
-    duration = float(times[:, -1].mean())
-    pace = lsq_linear(
-        np.concatenate([share * spent, trust]),
-        np.concatenate([share * times[:, chosen].reshape(-1), trust @ usual]),
-        bounds=(duration / FASTEST_PACE, np.inf),
-        method="bvls",  # exact, so that the unit of time makes no difference
-    ).x
-    arrivals = np.concatenate([[0.0], np.cumsum(width * pace[::-1])])
-    way = np.linspace(edges[-1], 0, 10 * TIMING_CELLS + 1)
-    return way, PchipInterpolator(edges[-1] - edges[::-1], arrivals)(edges[-1] - way)

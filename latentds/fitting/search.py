@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple, Protocol
 
@@ -24,7 +24,7 @@ from ..findings import HIDDEN, what_hides
 from ..metrics import dtw
 from ..time_law import PiecewiseLinearLaw
 from ..translations import Layers
-from .bundle import bundle, frames_across, smoothed, timing_of
+from .bundle import bundle, frames_across, smoothed
 from .embedding import arc_length_path, map_to_endpoints, straight_column
 from .homotopy import clear_direction, curvature_homotopy, drawn_homotopy, linear_homotopy, zoom_homotopy
 from .matching import apply_layers, match_along, pin_ends, track
@@ -51,7 +51,8 @@ class Plan:
             strands are close, that a deeper match is made on.
         trial_contraction: κ under which candidates are scored: they lead back to the path or they do not, whatever pull
             the motion is given.
-        contractions: among which κ is chosen for several demonstrations, per duration.
+        contractions: among which κ is chosen for several demonstrations, per duration: the least that leads from their
+            starts as near as any, but for the factor ``gentle``. A stronger pull makes velocities beside them worse.
         near, n_starts: distance from the demonstrated start, and number, of the starts that also score a candidate.
         n_times: even in time, of the rollouts that score one.
         tube_weight: what the distance of ψ's tube from the one around the path counts beside that of the rollouts.
@@ -80,6 +81,7 @@ class Plan:
     dense_points: int = 4800
     crowded_points: int = 2000
     trial_contraction: float = 20.0
+    gentle: float = 1.03
     contractions: tuple[float, ...] = tuple(float(kappa) for kappa in np.geomspace(1, 20, 6))
     near: float = 0.05
     n_starts: int = 32
@@ -314,14 +316,13 @@ class Search:
         """
         trial = self.try_out(candidate.layers, law, self.plan.trial_contraction)
         progress = trial.progress(torch.from_numpy(several.strands)).numpy()
-        way, times = timing_of(progress, several.arrivals)
-        pooled = PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
-        misses = []
+        pooled = PiecewiseLinearLaw.pooled(progress, several.arrivals)
+        misses = {}
         for kappa in self.plan.contractions if self.contraction is None else (self.contraction,):
-            ds = self.try_out(candidate.layers, pooled, kappa)
-            misses.append((several.missed_by(ds, self.plan.n_times), kappa))
-        miss, kappa = min(misses)
-        return pooled, kappa, miss
+            misses[kappa] = several.missed_by(self.try_out(candidate.layers, pooled, kappa), self.plan.n_times)
+        enough = self.plan.gentle * min(misses.values())
+        kappa = min((kappa for kappa, miss in misses.items() if miss <= enough), default=self.plan.trial_contraction)
+        return pooled, kappa, misses.get(kappa, math.inf)
 
     def _search_deeper(
         self, first: Candidate, path: Array, law: PiecewiseLinearLaw
@@ -335,10 +336,15 @@ class Search:
         wanted = (Excerpt.of(Demonstration(torch.from_numpy(timed), float(even[1]))),)
 
         def trial(candidate: Candidate) -> Trial:
+            if self.several is not None:
+                own, kappa, _ = self._choose_law_and_contraction(candidate, law, self.several)
+                return self.try_out(candidate.layers, own, kappa)
             return self.try_out(candidate.layers, law, plan.trial_contraction)
 
         def badness(candidate: Candidate) -> float:
             fidelity = measure(trial(candidate), wanted)
+            if self.several is not None:  # whose mean is nobody's motion: it is to be led along, in no time of its own
+                return max(bad for bad, _ in replace(fidelity, timing=0.0).findings)
             return max(fidelity.miss / plan.follows_below, *(bad for bad, _ in fidelity.findings))
 
         hidden = what_hides(shown.positions.numpy(), plan.hidden_above)
