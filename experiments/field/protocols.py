@@ -24,15 +24,19 @@ def thinned(shown: Demonstration, stride: int) -> Demonstration:
 def protocol_c(label: str, factory: Factory, shape: Sequence[Demonstration], seed: int = 0) -> Cell:
     """Held-out velocities (Figueroa and Billard 2018): trained on four, judged by the others, every second sample.
 
-    Rows tell, beside the usual, ``train_rmse``, ``train_e``, ``test_rmse`` and ``test_e``: see :func:`velocity_errors`.
+    Rows tell, beside the usual, ``train_rmse``, ``train_e``, ``test_rmse`` and ``test_e``: see :func:`velocity_errors`;
+    and ``command``, the largest velocity along motions from the starts that were shown over the largest shown.
     """
     thin = [thinned(shown, 2) for shown in shape]
     return Cell(label, factory, thin[:TRAINING], seed, judges=thin[TRAINING:], measure=held_out_velocities)
 
 
 def held_out_velocities(ds: StableDS, cell: Cell) -> dict[str, float]:
-    """The velocity errors at the samples shown and at the judges'."""
-    return {
+    """The velocity errors at the samples shown and at the judges', and the largest command."""
+    with torch.no_grad():
+        commands = [ds(ds.rollout(one.start, one.times)).norm(dim=-1).max() for one in cell.shown]
+    fastest = max(float(one.velocities.norm(dim=-1).max()) for one in cell.shown)
+    return {"command": float(max(commands)) / fastest} | {
         f"{part}_{what}": value
         for part, group in (("train", cell.shown), ("test", cell.judges))
         for what, value in velocity_errors(ds, group).items()
