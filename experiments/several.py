@@ -1,4 +1,4 @@
-"""Several demonstrations of one motion: every method of the field trained on four and judged by the other three.
+"""Several demonstrations of one motion: six methods trained on four and judged by the other three.
 
     python -m experiments.several [--quick] [--out results/several] [--jobs N]
 

@@ -28,7 +28,16 @@ from .deploy.controller import Controller
 from .deploy.tables import FieldTables, field_tables
 from .diffeomorphism import Diffeomorphism, eager_for_derivatives
 from .dynamics import Frame, LatentDynamics
-from .fidelity import COMMAND_LIMIT, EXCERPT_POINTS, ROUNDING_LIMIT, Excerpt, Fidelity, FitWarning, measure
+from .fidelity import (
+    COMMAND_LIMIT,
+    EXCERPT_POINTS,
+    ROUNDING_LIMIT,
+    Excerpt,
+    Fidelity,
+    FitWarning,
+    largest_speed,
+    measure,
+)
 from .files import write_tensors
 from .findings import every_finding
 from .integrate import integrate
@@ -273,8 +282,7 @@ class StableDS(nn.Module, ABC):
         if shown and no_active_transforms() and not moved.attractor.requires_grad:
             begin = torch.tensor([one.path[0] for one in shown], dtype=torch.float64).to(self.attractor)
             with torch.no_grad():
-                fastest = torch.linalg.vector_norm(moved(begin), dim=-1).max()
-            command = float(fastest) / max(one.fastest for one in shown)
+                command = largest_speed(moved, begin) / max(one.fastest for one in shown)
             if not command <= COMMAND_LIMIT:
                 warnings.warn(
                     f"with_goal: from where it was shown to begin, the first command is now {command:.3g} times the "

@@ -261,7 +261,7 @@ def measure(ds: System, shown: Sequence[Excerpt]) -> Fidelity:
         shares = draw.dirichlet(np.ones(len(shown)), NEARBY_STARTS)
         between = torch.from_numpy(shares @ np.stack([path[0] for path in paths])).to(ds.attractor)
         times = torch.linspace(0, duration, EXCERPT_POINTS, dtype=torch.float64).to(ds.attractor.device)
-        figures["command"] = float(np.max([figures["command"], _largest_speed(ds, ds.rollout(between, times))]))
+        figures["command"] = float(np.max([figures["command"], largest_speed(ds, ds.rollout(between, times))]))
     for name in ("command", "fastest"):
         figures[name] /= max(one.fastest for one in shown)
     goals = np.stack([path[-1] for path in paths])
@@ -288,7 +288,8 @@ def _worst_coordinate(motion: Array, path: Array, still: float) -> float:
     return float(np.max(missed, initial=0.0))
 
 
-def _largest_speed(ds: System, points: Tensor) -> float:
+def largest_speed(ds: System, points: Tensor) -> float:
+    """Of the velocities at points (..., n), units per second."""
     return float(torch.linalg.vector_norm(ds(points), dim=-1).max())
 
 
@@ -313,8 +314,8 @@ def _measure(
         "length_ratio": path_length_ratio(motions[0], path, one.ruler),
         "end": endpoint_error(motions[0], path) / size,
         "nearby": float(np.max(missed[1:], initial=0.0)),
-        "command": _largest_speed(ds, moved),
-        "fastest": _largest_speed(ds, torch.from_numpy(np.concatenate([path, beside])).to(ds.attractor)),
+        "command": largest_speed(ds, moved),
+        "fastest": largest_speed(ds, torch.from_numpy(np.concatenate([path, beside])).to(ds.attractor)),
         "timing": _timing_gap(motions[0], duration, path, pace * one.duration) / size,
         "coordinate": _worst_coordinate(motions[0], path, max(one.ruler, CONSTANT_WITHIN * size)),
         "rise": float(energy.diff().max() / energy[0]),

@@ -203,11 +203,11 @@ def rollout(
     if goal is not None:
         ds = ds.with_start_and_goal(begin, given.numbers(goal, "goal", ds.dim))
     times = torch.linspace(0, seconds, points, dtype=torch.float64)
-    held = ds.controller(max_speed=max_speed)
     with torch.no_grad(), interrupts_kept():
-        if math.isinf(max_speed):
+        if max_speed == math.inf:
             motion = ds.rollout(begin.to(ds.attractor), times)
         else:
+            held = ds.controller(max_speed=max_speed)
             motion = integrate(
                 lambda y: torch.from_numpy(held(y.numpy())), begin.double(), times, ds.attractor.double()
             )
