@@ -30,6 +30,7 @@ from .homotopy import clear_direction, curvature_homotopy, drawn_homotopy, linea
 from .matching import apply_layers, match_along, pin_ends, track
 from .refinement import refine
 from .strands import Strands, crowded
+from .velocities import Fitted, Shown, learned, with_wide_layers
 
 
 @dataclass(frozen=True)
@@ -160,7 +161,7 @@ class Candidate(NamedTuple):
         return float(np.square(apply_layers(self.layers, line) - path).mean())
 
 
-class Trial(System, Protocol):
+class Trial(System, Fitted, Protocol):
     """The system that a candidate makes."""
 
     def progress(self, y: Tensor) -> Tensor:
@@ -240,8 +241,22 @@ class Search:
             best, notes = self._search_deeper(best, path, law)
         kappa = self.contraction or self.plan.trial_contraction
         if self.several is not None:
-            law, kappa, _ = self._choose_law_and_contraction(best, law, self.several)
+            law, kappa, missed = self._choose_law_and_contraction(best, law, self.several)
+            if self.refined and self.n_layers is None:
+                best, law = self._with_velocities(best, law, kappa, missed, self.several)
         return Match(best, law, kappa, notes)
+
+    def _with_velocities(
+        self, best: Candidate, law: PiecewiseLinearLaw, kappa: float, missed: float, several: Several
+    ) -> tuple[Candidate, PiecewiseLinearLaw]:
+        """The match and law whose velocities are nearer to those shown, if its motions stay as near."""
+        shown = Shown.of(several.strands, several.arrivals, self.plan.n_times)
+        more = with_wide_layers(best.layers, shown, self.shape.size)
+        n_wide = len(more.widths) - len(best.layers.widths)
+        for layers, own in learned(self.try_out(more, law, kappa), shown, n_wide):
+            if several.missed_by(self.try_out(layers, own, kappa), self.plan.n_times) <= self.plan.gentle * missed:
+                return best._replace(layers=layers), own
+        return best, law
 
     def _best_of_few(self, path: Array, law: PiecewiseLinearLaw) -> Candidate:
         plan, several = self.plan, self.several

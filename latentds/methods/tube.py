@@ -64,7 +64,8 @@ class TubeDS(LatentDS):
 
     Several demonstrations of one motion are fitted by their mean path at equal progress, with a common goal, and by the
     time law under which each, from where it starts, keeps its own times most nearly. What lies beside that path is
-    matched too, as far as it leaves room, so that ψ is near-isometric across it.
+    matched too, as far as it leaves room, so that ψ is near-isometric across it, and a few wide layers at the end bring
+    velocities nearer to those shown: see :mod:`latentds.fitting.velocities`.
 
     Args:
         dim: n >= 1.
@@ -114,7 +115,7 @@ class TubeDS(LatentDS):
             trial._assign(layers, shape, law, kappa)
             return trial
 
-        several = Several((strands - origin) / unit, arrivals) if len(shown) > 1 else None
+        several = Several(((strands - origin) / unit).round(DECIMALS), arrivals) if len(shown) > 1 else None
         search = Search(shape, several, try_out, self.n_layers, self.homotopy, self.refined, self.contraction, PLAN)
         path = search.path_and_law[0]
         refuse_crossings(path, origin, unit)
