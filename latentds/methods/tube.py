@@ -189,7 +189,7 @@ def mean_motion(shown: Sequence[Demonstration]) -> tuple[Demonstration, Array, A
     for one in shown:
         path, way, times = arc_length_path(one.positions.numpy(), one.times.numpy(), PLAN.n_points)
         paths.append(path + even[:, None] * (goal - path[-1]))
-        arrivals.append(np.interp(even, 1 - way, times))
+        arrivals.append(one.duration * (np.interp(even, 1 - way, times) / one.duration).round(DECIMALS))
     strands = np.stack(paths)
     if len(shown) == 1:
         return shown[0], strands, np.stack(arrivals)

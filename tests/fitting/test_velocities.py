@@ -87,3 +87,11 @@ def test_less_is_tried_after_all_that_can_be_learned(with_and_without):
 
 def moving(shown):
     return shown.positions, shown.velocities
+
+
+@pytest.mark.slow
+def test_units_and_origin_of_several_do_not_matter(with_and_without):
+    here, y = with_and_without[0], 1.03 * arcs()[1].positions[::8]
+    there = TubeDS(2).fit([Demonstration(1000 * one.positions + 17.3, one.dt) for one in arcs()])
+    with torch.no_grad():
+        assert (there(1000 * y + 17.3) / 1000 - here(y)).norm(dim=-1).max() < 1e-9
