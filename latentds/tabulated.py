@@ -85,7 +85,7 @@ def rounded_pieces(knots: Tensor, speeds: Tensor) -> Tensor:
     before, after = speeds - slopes[:-1] * half, speeds + slopes[1:] * half
     # Of the ends and the knot between, as h'² and 2 h h'' would cancel where h falls to a small part of itself.
     discriminant = (speeds.square() - before * after) / half.square()
-    straight = [torch.cat([none, knots + half]), torch.cat([none, after]), slopes, 0 * slopes, slopes.square()]
-    curved = [knots - half, before, slopes[:-1], slopes.diff() / (4 * half), discriminant]
-    straight, curved = torch.stack(straight), torch.stack(curved)
+    begins, speed = (torch.cat([none, part]) for part in (knots + half, after))
+    straight = torch.stack([begins, speed, slopes, torch.zeros_like(slopes), slopes.square()])
+    curved = torch.stack([knots - half, before, slopes[:-1], slopes.diff() / (4 * half), discriminant])
     return torch.cat([torch.stack([straight[:, :-1], curved], dim=-1).flatten(1), straight[:, -1:]], dim=1)

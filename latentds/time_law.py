@@ -201,7 +201,8 @@ class KnottedLaw(TimeLaw):
         pieces = self._pieces()
         start, speed, slope, bend, _ = pieces[:, torch.bucketize(s.detach(), pieces[0, 1:])]
         ahead = torch.minimum(s, pieces[0, -1]) - start  # h is constant on the last piece, at infinity too
-        return speed + ahead * (slope + ahead * bend)
+        h: Tensor = speed + ahead * (slope + ahead * bend)
+        return h
 
     def time_to_go(self, s: Tensor) -> Tensor:
         pieces = self._pieces()

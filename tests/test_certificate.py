@@ -205,7 +205,7 @@ class Stalls(Sound):
 
     def __init__(self):
         super().__init__()
-        knots, speeds = torch.tensor([0.3, 0.5, 0.6, 0.7]), torch.tensor([0.3, 1e-6, 1e-6, 1.0])
+        knots, speeds = torch.tensor([0.3, 0.45, 0.5, 0.6, 0.65, 0.8]), torch.tensor([0.3, *[1e-6] * 4, 1.0])
         self.dynamics.law = KnottedLaw(knots, speeds)
 
 
