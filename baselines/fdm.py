@@ -6,7 +6,7 @@ from latentds.arguments import Array
 from latentds.demonstration import Demonstration
 from latentds.fitting.embedding import map_to_endpoints, straight_column
 from latentds.methods.greedy import GreedyDS
-from latentds.time_law import PiecewiseLinearLaw
+from latentds.time_law import KnottedLaw
 
 
 class FDM(GreedyDS):
@@ -20,5 +20,5 @@ class FDM(GreedyDS):
         return map_to_endpoints(straight_column(len(shown)), shown.start.numpy(), shown.goal.numpy())
 
     @staticmethod
-    def time_law(duration: float) -> PiecewiseLinearLaw:
-        return PiecewiseLinearLaw.uniform(duration)
+    def time_law(duration: float) -> KnottedLaw:
+        return KnottedLaw.uniform(duration)

@@ -47,7 +47,7 @@ from .memo import Memo
 from .probes import restart_gap, round_trip_gap
 from .similarity import Similarity, check_rotation, turned_onto
 
-FORMAT = 4
+FORMAT = 5
 """Of the files of systems; raised when they change so that another latentds would misread them."""
 
 Self = TypeVar("Self", bound="StableDS")

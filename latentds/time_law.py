@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from .arguments import Array, positive
 from .resizing import make_room
-from .tabulated import LawKind, LawTable, Tabulated
+from .tabulated import LawKind, LawTable, Tabulated, rounded_pieces
 
 LINEAR_BELOW = 1e-3
 """Progress below which laws turn linear, ṡ ∝ -s: a law that reaches the goal in finite time is not Lipschitz there."""
@@ -23,6 +23,8 @@ BEGINS_WITHIN = 0.06
 """A motion that begins, often from rest, does not count within so much of the way where others pass."""
 SLOWEST = 1e-2
 """Least speed of a pooled law, in ways per duration, where all rest."""
+SERIES_BELOW = 1e-3
+"""Where series of five terms, exact to rounding, take the place of what divides by the root of a discriminant."""
 
 
 class TimeLaw(Tabulated, nn.Module, ABC):
@@ -104,12 +106,15 @@ class ChebyshevLaw(TimeLaw):
         return LawTable(LawKind.EIGENMAP, np.ones(1), np.array([float(self.omega)]))
 
 
-class PiecewiseLinearLaw(TimeLaw):
-    """h linear between knots, h(0) = 0, constant above the last knot.
+class KnottedLaw(TimeLaw):
+    """h linear from 0 to the first knot, between knots, and constant above the last, with its corners rounded.
+
+    Parabolas round them (:func:`latentds.tabulated.rounded_pieces`), so that h' is continuous, and the acceleration of
+    a motion with it; h stays between neighbouring values of the polygon.
 
     Args:
-        knots: (m,) progress, 0 < knots[0] < … < knots[m-1]; below the first one the law is linear to 0.
-        speeds: (m,) h at the knots, > 0, per second.
+        knots: (m,) progress, 0 < knots[0] < … < knots[m-1].
+        speeds: (m,) of the polygon at the knots, > 0, per second.
     """
 
     knots: Tensor
@@ -123,18 +128,18 @@ class PiecewiseLinearLaw(TimeLaw):
         self.register_buffer("speeds", speeds)
 
     @classmethod
-    def uniform(cls, duration: float = 1.0) -> PiecewiseLinearLaw:
+    def uniform(cls, duration: float = 1.0) -> KnottedLaw:
         """Constant rate 1 / duration above the tail: the line that FDM moves on."""
         speed = 1 / positive(duration, "duration")
         return cls(torch.tensor([LINEAR_BELOW], dtype=torch.float64), torch.tensor([speed], dtype=torch.float64))
 
     @classmethod
-    def from_timing(cls, progress: Tensor, times: Tensor, n_knots: int = 256) -> PiecewiseLinearLaw:
+    def from_timing(cls, progress: Tensor, times: Tensor, n_knots: int = 256) -> KnottedLaw:
         """The law under which progress falls as shown: a demonstrated time law.
 
         Knots lie where progress and time, both as shares, advance evenly together, so that slow and fast parts are
         resolved alike; their speeds are settled until the time between any two knots is the demonstrated one. Before
-        the start the speed rises (or falls) to the mean within 2 % of the way, so that a start at rest does not hold
+        the start the speed rises (or falls) to the mean within 3 % of the way, so that a start at rest does not hold
         up what starts behind it.
 
         Args:
@@ -152,27 +157,22 @@ class PiecewiseLinearLaw(TimeLaw):
         spans = np.maximum(-np.diff(arrivals), 1e-9 * t[-1])
         gaps = np.diff(knots)
         pace = np.interp(knots, (knots[1:] + knots[:-1]) / 2, spans / gaps)
-        speeds = 1 / pace
-        for _ in range(30):  # the time over a segment is gap · log(b/a) / (b-a): nudge both ends by what it lacks
-            low, high = speeds[:-1], speeds[1:]
-            ratio = high / low
-            bend = np.where(np.abs(ratio - 1) < 1e-6, 1.0, np.log(ratio) / np.where(ratio == 1, 1.0, ratio - 1))
-            excess = np.log(gaps / low * bend / spans)
-            nudge = np.zeros_like(speeds)
-            nudge[:-1] += excess
-            nudge[1:] += excess
-            nudge[1:-1] /= 2
-            speeds = speeds * np.exp(0.5 * nudge)
         mean = s[0] / t[-1]
-        return cls(torch.from_numpy(np.append(knots, s[0] + 0.02)), torch.from_numpy(np.append(speeds, mean)))
+        law = cls(torch.from_numpy(np.append(knots, s[0] + 0.02)), torch.from_numpy(np.append(1 / pace, mean)))
+        for _ in range(30):  # nudge both ends of a gap by what the time over it lacks
+            excess = (law.time_to_go(law.knots[:-1]).diff() / torch.from_numpy(spans)).log()
+            nudge = torch.nn.functional.pad(excess, (1, 0)) + torch.nn.functional.pad(excess, (0, 1))
+            nudge[1:-1] /= 2
+            law.speeds[:-1] *= (0.5 * nudge).exp()
+        return law
 
     @classmethod
-    def pooled(cls, progress: Array, times: Array) -> PiecewiseLinearLaw:
+    def pooled(cls, progress: Array, times: Array) -> KnottedLaw:
         """The law of several motions: in each cell, the way that all pass there over the time that all spend there.
 
         No cell is faster than the fastest was there. Where one begins and others pass, these alone count, so that who
         starts behind does not wait where others stood. Before the hindmost start the speed turns to the mean within
-        2 % of the way.
+        3 % of the way.
 
         Args:
             progress: (K, N), of each motion from about 1 at its start to 0 at the goal.
@@ -198,38 +198,44 @@ class PiecewiseLinearLaw(TimeLaw):
         return cls(torch.from_numpy(knots), torch.from_numpy(np.concatenate([speeds[:1] / 2, speeds, [mean]])))
 
     def speed(self, s: Tensor) -> Tensor:
-        low, high = self._segment(torch.bucketize(s.detach(), self.knots))
-        fraction = ((s - low[0]) / (high[0] - low[0])).clamp(max=1.0)
-        return low[1] + fraction * (high[1] - low[1])
+        pieces = self._pieces()
+        start, speed, slope, bend, _ = pieces[:, torch.bucketize(s.detach(), pieces[0, 1:])]
+        ahead = torch.minimum(s, pieces[0, -1]) - start  # h is constant on the last piece, at infinity too
+        h: Tensor = speed + ahead * (slope + ahead * bend)
+        return h
 
     def time_to_go(self, s: Tensor) -> Tensor:
-        index = torch.bucketize(s.detach(), self.knots)
-        low, high = self._segment(index)
-        inside = low[2] + _travel_time(s - low[0], low[1], (high[1] - low[1]) / (high[0] - low[0]))
-        tail = self.knots[0] / self.speeds[0] * torch.log(s.clamp(max=self.knots[0]) / self.knots[0])
-        return torch.where(index == 0, tail, inside)
+        pieces = self._pieces()
+        index = torch.bucketize(s.detach(), pieces[0, 1:])
+        start, *piece = pieces[:, index.clamp(min=1)]
+        edge, rate = pieces[0, 1], pieces[2, 0]
+        inside = _arrivals(pieces)[index] + _travel_time(torch.where(index == 0, 0.0, s - start), *piece)
+        return torch.where(index == 0, torch.log(s.clamp(max=edge) / edge) / rate, inside)
 
     def progress_at(self, time: Tensor) -> Tensor:
-        arrivals = self._arrivals()
-        index = torch.bucketize(time.detach(), arrivals)
-        low, high = self._segment(index)
-        slope = (high[1] - low[1]) / (high[0] - low[0])
-        inside = low[0] + _travel(torch.where(index == 0, 0.0, time - low[2]), low[1], slope)
-        tail = self.knots[0] * torch.exp(self.speeds[0] / self.knots[0] * time.clamp(max=0.0))
-        return torch.where(index == 0, tail, inside)
+        pieces = self._pieces()
+        arrivals = _arrivals(pieces)
+        index = torch.bucketize(time.detach(), arrivals[1:])
+        start, *piece = pieces[:, index.clamp(min=1)]
+        inside = start + _travel(torch.where(index == 0, 0.0, time - arrivals[index]), *piece)
+        return torch.where(index == 0, pieces[0, 1] * torch.exp(pieces[2, 0] * time.clamp(max=0.0)), inside)
 
     def convergence_rate_bound(self, reach: float) -> float:
         try:
             _check_knots(self.knots, self.speeds)  # whoever wrote them after the constructor did
         except ValueError:
             return -math.inf
-        # h(s)/s is monotone between two knots
-        ends = torch.cat([self.knots[self.knots < reach], self.knots.new_tensor([reach])])
-        return float((self.speed(ends) / ends).min())
+        start, speed, slope, bend, _ = self._pieces()
+        # h/s = bend s + … + constant / s of a piece has its least at an end, or where both terms are equal
+        constant = speed - start * (slope - start * bend)
+        inner = (constant / bend)[(bend > 0) & (constant > 0)].sqrt()
+        s = torch.cat([start[1:], inner, start.new_tensor([reach])])
+        s = s[s <= reach]
+        return float((self.speed(s) / s).min())
 
     def table(self) -> LawTable:
         numbers = torch.stack([self.knots, self.speeds]).detach().to("cpu", torch.float64, copy=True).numpy()
-        return LawTable(LawKind.PIECEWISE_LINEAR, *numbers)
+        return LawTable(LawKind.KNOTTED, *numbers)
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         """A fit chooses how many knots there are, so a fresh law takes any number."""
@@ -243,19 +249,8 @@ class PiecewiseLinearLaw(TimeLaw):
             make_room(self, state_dict, prefix, ["knots", "speeds"])
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
-    def _arrivals(self) -> Tensor:
-        """Seconds from each knot to the first one, (m,)."""
-        gaps = self.knots.diff()
-        steps = _travel_time(gaps, self.speeds[:-1], self.speeds.diff() / gaps)
-        return torch.cat([torch.zeros_like(self.knots[:1]), steps.cumsum(0)])
-
-    def _segment(self, index: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """(progress, speed, seconds) at the lower and (progress, speed) at the upper end of segment 0 … m."""
-        zero, beyond = torch.zeros_like(self.knots[:1]), self.knots[-1:] + 1
-        knots = torch.cat([zero, self.knots, beyond])
-        speeds = torch.cat([zero, self.speeds, self.speeds[-1:]])
-        arrivals = torch.cat([zero, self._arrivals()])
-        return (knots[index], speeds[index], arrivals[index]), (knots[index + 1], speeds[index + 1])
+    def _pieces(self) -> Tensor:
+        return rounded_pieces(self.knots, self.speeds)
 
 
 def _check_knots(knots: Tensor, speeds: Tensor) -> None:
@@ -268,18 +263,47 @@ def _check_knots(knots: Tensor, speeds: Tensor) -> None:
         raise ValueError(f"speeds: expected {tuple(knots.shape)} finite numbers > 0, got {speeds.tolist()!r:.80}")
 
 
-def _travel_time(distance: Tensor, speed: Tensor, slope: Tensor) -> Tensor:
-    """Seconds to cover ``distance`` while the speed grows by ``slope`` per unit: log(1 + slope d / speed) / slope."""
-    safe = torch.where(speed > 0, speed, 1.0)
-    ratio = (slope * distance / safe).clamp(min=-1 + 1e-12)
-    near = ratio.abs() < 1e-6
-    log = torch.log1p(torch.where(near, 1.0, ratio)) / torch.where(near, 1.0, ratio)
-    return distance / safe * torch.where(near, 1 - ratio / 2 + ratio.square() / 3, log)
+def _arrivals(pieces: Tensor) -> Tensor:
+    """Seconds from the start of each piece to the edge of the tail, (2m+1,); 0 of the tail itself."""
+    steps = _travel_time(pieces[0].diff()[1:], *pieces[1:, 1:-1])
+    return torch.cat([torch.zeros_like(pieces[0, :2]), steps.cumsum(0)])
 
 
-def _travel(time: Tensor, speed: Tensor, slope: Tensor) -> Tensor:
-    """The inverse: speed (exp(slope t) - 1) / slope."""
-    growth = slope * time
-    near = growth.abs() < 1e-6
-    factor = torch.expm1(torch.where(near, 1.0, growth)) / torch.where(near, 1.0, growth)
-    return speed * time * torch.where(near, 1 + growth / 2 + growth.square() / 6, factor)
+def _travel_time(distance: Tensor, speed: Tensor, slope: Tensor, bend: Tensor, discriminant: Tensor) -> Tensor:
+    """Seconds over ``distance`` from where h, h' and h''/2 are ``speed``, ``slope`` and ``bend``: ∫ dδ / h.
+
+    2/√D artanh(√D δ/q), with D = h'² - 2 h h'' and q = 2h + h' δ; an arctangent where D < 0.
+    """
+    q, ending = 2 * speed + slope * distance, speed + distance * (slope + distance * bend)
+    near, roots = _near_and_roots(discriminant, distance / q)
+    z = torch.where(near, discriminant * (distance / q).square(), 0.0)
+    series = 2 * distance / q * (1 + z * (1 / 3 + z * (1 / 5 + z * (1 / 7 + z / 9))))
+    # 1 - (√D δ/q)² is 4 h(0) h(δ) / q²: said so, the logarithm does not cancel where h nearly vanishes
+    gone = roots[0] * distance
+    hyperbolic = torch.log1p((gone * (q + gone) / (2 * speed * ending)).clamp(min=0)) / roots[0]
+    circular = 2 * torch.atan2(roots[1] * distance, q) / roots[1]
+    return torch.where(near, series, torch.where(discriminant > 0, hyperbolic, circular))
+
+
+def _travel(time: Tensor, speed: Tensor, slope: Tensor, bend: Tensor, discriminant: Tensor) -> Tensor:
+    """The inverse: 2 h T / (√D - h' T), T = tanh(√D τ/2)."""
+    near, roots = _near_and_roots(discriminant, time / 2)
+    within = torch.where(near, time, 0.0)
+    w = discriminant * within.square() / 4
+    within = within * (1 + w * (-1 / 3 + w * (2 / 15 + w * (-17 / 315 + w * 62 / 2835))))
+    series = speed * within / (1 - slope * within / 2)
+    growth = torch.expm1(roots[0] * torch.where(near | (discriminant < 0), 0.0, time))
+    steep = roots[0] + slope.abs()
+    lean = torch.where(slope > 0, -4 * bend * speed / steep, steep)  # √D - h', without cancellation
+    hyperbolic = 2 * speed * growth / (2 * roots[0] + lean * growth)
+    angle = roots[1] * torch.where(near | (discriminant > 0), 0.0, time) / 2
+    circular = 2 * speed * angle.sin() / (roots[1] * angle.cos() - slope * angle.sin())
+    return torch.where(near, series, torch.where(discriminant > 0, hyperbolic, circular))
+
+
+def _near_and_roots(discriminant: Tensor, factor: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    """Where a series serves, by D ``factor``²; √D, √-D, and 1 where they are not needed, so that gradients exist."""
+    near = (discriminant * factor.square()).abs() < SERIES_BELOW
+    squares = (torch.where(near | (sign * discriminant <= 0), 1.0, sign * discriminant) for sign in (1, -1))
+    positive_root, negative_root = (square.sqrt() for square in squares)
+    return near, (positive_root, negative_root)

@@ -16,7 +16,7 @@ from latentds import Demonstration, LatentDS, Learned, LocallyWeightedTranslatio
 from latentds.dynamics import RayDynamics, TubeDynamics
 from latentds.kernels.dispatch import reference
 from latentds.testing import wavy_motion
-from latentds.time_law import PiecewiseLinearLaw
+from latentds.time_law import KnottedLaw
 
 
 @pytest.mark.parametrize("dim", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(7, marks=pytest.mark.slow)])
@@ -36,7 +36,7 @@ class Sound(LatentDS):
     """A bent space with one ray to the goal, at (1, 0)."""
 
     def __init__(self, dim=2):
-        super().__init__(dim, LocallyWeightedTranslations(dim, 3), RayDynamics(PiecewiseLinearLaw.uniform()))
+        super().__init__(dim, LocallyWeightedTranslations(dim, 3), RayDynamics(KnottedLaw.uniform()))
         psi, draw = self.diffeomorphism, torch.Generator().manual_seed(1)
         with torch.no_grad():
             psi.centers.normal_(generator=draw)
@@ -205,8 +205,8 @@ class Stalls(Sound):
 
     def __init__(self):
         super().__init__()
-        knots, speeds = torch.tensor([0.3, 0.5, 0.6, 0.7]), torch.tensor([0.3, 1e-6, 1e-6, 1.0])
-        self.dynamics.law = PiecewiseLinearLaw(knots, speeds)
+        knots, speeds = torch.tensor([0.3, 0.45, 0.5, 0.6, 0.65, 0.8]), torch.tensor([0.3, *[1e-6] * 4, 1.0])
+        self.dynamics.law = KnottedLaw(knots, speeds)
 
 
 class RunsBackwards(Sound):
@@ -363,7 +363,7 @@ def test_an_axis_that_is_too_long_proves_nothing(monkeypatch):
     """By 1e-4: what lies along it then counts a little as across, is pushed away, and outweighs a slow stretch."""
     ds = TubeDS(2, n_layers=30, refined=False).fit(wavy_motion(2))
     ds.fit_report = None
-    ds.dynamics.law = PiecewiseLinearLaw([0.001, 0.5, 0.6, 0.7, 1.0], [0.5, 0.5, 1e-4, 1e-4, 0.5])
+    ds.dynamics.law = KnottedLaw([0.001, 0.5, 0.6, 0.7, 1.0], [0.5, 0.5, 1e-4, 1e-4, 0.5])
     lines = {line.claim: line.verdict for line in certify(ds, n_samples=100).lines}
     rate = "latent motions approach the goal, -V̇/2V >= rate > 0"
     assert lines[rate] == "proven"
@@ -524,7 +524,7 @@ class StopsOnTheWay(TubeDynamics):
         return torch.where(beside, -1.0, 1.0) * super().forward(x, y, frame)
 
 
-class RunsBack(PiecewiseLinearLaw):
+class RunsBack(KnottedLaw):
     def speed(self, s):
         return torch.where((s > 0.7) & (s < 0.7002), -1.0, 1.0) * super().speed(s)
 

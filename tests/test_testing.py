@@ -18,7 +18,7 @@ from latentds.demonstration import only_one
 from latentds.dynamics import RayDynamics
 from latentds.testing import check_stable_ds, parametrize_stable_ds, wavy_motion
 from latentds.testing.clauses import CLAUSES, FIT_CLAUSES
-from latentds.time_law import PiecewiseLinearLaw
+from latentds.time_law import KnottedLaw
 
 pytest_plugins = ["pytester"]
 
@@ -59,7 +59,7 @@ class Latent(LatentDS):
 
     def __init__(self, dim):
         psi = LocallyWeightedTranslations(dim, 2)
-        super().__init__(dim, psi, RayDynamics(PiecewiseLinearLaw.uniform()))
+        super().__init__(dim, psi, RayDynamics(KnottedLaw.uniform()))
 
     def _learn(self, shown, progress):
         motion = only_one(shown, "Latent")

@@ -20,7 +20,7 @@ from latentds.benchmark import Cell
 from latentds.demonstration import only_one
 from latentds.dynamics import RayDynamics, TubeDynamics
 from latentds.methods.greedy import GreedyDS
-from latentds.time_law import PiecewiseLinearLaw
+from latentds.time_law import KnottedLaw
 
 
 class Variant(LatentDS):
@@ -42,7 +42,7 @@ class Variant(LatentDS):
         motion = only_one(shown, "Variant")
         learned = self.base._learn(shown, progress)
         if self.contraction is not None:
-            across = PiecewiseLinearLaw(torch.ones(1), torch.tensor([self.contraction / motion.duration]))
+            across = KnottedLaw(torch.ones(1), torch.tensor([self.contraction / motion.duration]))
             self.dynamics = TubeDynamics(self.base.dynamics.law, across)
         with torch.no_grad():
             # The latent line runs from the start to the goal themselves, so x_N is the goal.

@@ -93,9 +93,9 @@ def _law(law: LawTable, key: str, words: dict[str, Any]) -> str:
         template = _EIGENMAP
     else:
         numbers = {"pieces": law.pieces()}
-        template = _PIECEWISE
+        template = _KNOTTED
     text = {k: _braces(value, words["f"]) for k, value in numbers.items()}
-    return template.substitute(words, **text, key=key, count=len(law.knots) + 1)
+    return template.substitute(words, **text, key=key, count=law.pieces().shape[1])
 
 
 def _braces(numbers: Any, suffix: str) -> str:
@@ -210,9 +210,9 @@ static inline $real ${NAME}_$key$f($real s) {
 
 """)
 
-_PIECEWISE = Template("""\
-/* The time law $key the axis, over the progress s: where its pieces start, the speed there, its slope from there. */
-static const $real ${NAME}_${key}_law$f[3][$count] = $pieces;
+_KNOTTED = Template("""\
+/* The time law $key the axis, over the progress s: where its pieces start, and there h, h' and h''/2. */
+static const $real ${NAME}_${key}_law$f[4][$count] = $pieces;
 static inline $real ${NAME}_$key$f($real s) {
     const $real *const start = ${NAME}_${key}_law$f[0], *const speed = start + $count, *const slope = speed + $count;
     int low = 0, high = $count;
@@ -222,7 +222,8 @@ static inline $real ${NAME}_$key$f($real s) {
         else high = middle;
     }
     if (low == 0) return slope[0];
-    return (speed[low] + ((s < start[$count - 1] ? s : start[$count - 1]) - start[low]) * slope[low]) / s;
+    const $real ahead = (s < start[$count - 1] ? s : start[$count - 1]) - start[low];
+    return (speed[low] + ahead * (slope[low] + ahead * slope[$count + low])) / s;
 }
 
 """)

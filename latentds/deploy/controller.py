@@ -128,7 +128,7 @@ class Controller:
         """∂f/∂y, exact, of the velocity as it is returned: its goal, speed and limit included.
 
         The acceleration along the motion, for feed-forward, is ``jacobian(y) @ controller(y)`` while the goal rests.
-        Where a time law has a kink it is that of one side.
+        Where a time law has a kink, as the eigenmap's has, it is that of one side.
 
         Args:
             y: as for a call.

@@ -193,6 +193,8 @@ def _rate(law: LawTable, s: _Value) -> _Value:
         inside = s.op("Min", 1.0)
         return ((inside * -1.0 + 2.0) / inside).op("Sqrt") * (inside / s) * float(law.speeds[0])
     s = s.op("Max", np.finfo(np.float64).tiny ** 0.25)  # far inside the tail, where h(s)/s no longer changes
-    index = s.op("Greater", law.knots).op("Cast", to=TensorProto.INT64).sum()
-    start, speed, slope = (s.graph.constant(part).op("Gather", index) for part in law.pieces())
-    return (speed + (s.op("Min", law.knots[-1]) - start) * slope) / s
+    pieces = law.pieces()
+    index = s.op("Greater", pieces[0, 1:]).op("Cast", to=TensorProto.INT64).sum()
+    start, speed, slope, bend = (s.graph.constant(part).op("Gather", index) for part in pieces)
+    ahead = s.op("Min", pieces[0, -1]) - start
+    return (speed + ahead * (slope + ahead * bend)) / s

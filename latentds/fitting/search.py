@@ -22,7 +22,7 @@ from ..demonstration import Demonstration
 from ..fidelity import Excerpt, System, measure
 from ..findings import HIDDEN, what_hides
 from ..metrics import dtw
-from ..time_law import PiecewiseLinearLaw
+from ..time_law import KnottedLaw
 from ..translations import Layers
 from .bundle import bundle, frames_across, smoothed
 from .embedding import arc_length_path, map_to_endpoints, straight_column
@@ -171,7 +171,7 @@ class Trial(System, Fitted, Protocol):
         """cond(J) along the latent line, (n_points,)."""
 
 
-TryOut = Callable[[Layers, PiecewiseLinearLaw, float], Trial]
+TryOut = Callable[[Layers, KnottedLaw, float], Trial]
 """The system of layers, time law and κ, for the motion that is searched for."""
 
 
@@ -197,7 +197,7 @@ class Match(NamedTuple):
     """What a search ends with."""
 
     candidate: Candidate
-    law: PiecewiseLinearLaw
+    law: KnottedLaw
     contraction: float
     notes: tuple[str, ...]
 
@@ -227,10 +227,10 @@ class Search:
     plan: Plan
 
     @cached_property
-    def path_and_law(self) -> tuple[Array, PiecewiseLinearLaw]:
+    def path_and_law(self) -> tuple[Array, KnottedLaw]:
         """(N, n) even in arc length, and the demonstrated time law."""
         points, way, times = arc_length_path(self.shape.positions.numpy(), self.shape.times.numpy(), self.plan.n_points)
-        return points, PiecewiseLinearLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
+        return points, KnottedLaw.from_timing(torch.from_numpy(way), torch.from_numpy(times))
 
     @torch.no_grad()
     def run(self) -> Match:
@@ -247,8 +247,8 @@ class Search:
         return Match(best, law, kappa, notes)
 
     def _with_velocities(
-        self, best: Candidate, law: PiecewiseLinearLaw, kappa: float, missed: float, several: Several
-    ) -> tuple[Candidate, PiecewiseLinearLaw]:
+        self, best: Candidate, law: KnottedLaw, kappa: float, missed: float, several: Several
+    ) -> tuple[Candidate, KnottedLaw]:
         """The match and law whose velocities are nearer to those shown, if its motions stay as near."""
         shown = Shown.of(several.strands, several.arrivals, self.plan.n_times)
         more = with_wide_layers(best.layers, shown, self.shape.size)
@@ -258,7 +258,7 @@ class Search:
                 return best._replace(layers=layers), own
         return best, law
 
-    def _best_of_few(self, path: Array, law: PiecewiseLinearLaw) -> Candidate:
+    def _best_of_few(self, path: Array, law: KnottedLaw) -> Candidate:
         plan, several = self.plan, self.several
         scored = []
         for candidate in self._candidates(path, self.n_layers or plan.n_layers):
@@ -295,7 +295,7 @@ class Search:
                 for width in widths:
                     yield matched("curvature", curves, width)
 
-    def _score(self, candidate: Candidate, path: Array, law: PiecewiseLinearLaw) -> float:
+    def _score(self, candidate: Candidate, path: Array, law: KnottedLaw) -> float:
         """How badly it rolls out from the demonstrated start (thrice) and from near it, times √cond(J), or more.
 
         Of several demonstrations, how badly their own starts lead along them and how badly what lies beside their mean
@@ -323,15 +323,15 @@ class Search:
         return score if math.isfinite(score) else math.inf
 
     def _choose_law_and_contraction(
-        self, candidate: Candidate, law: PiecewiseLinearLaw, several: Several
-    ) -> tuple[PiecewiseLinearLaw, float, float]:
+        self, candidate: Candidate, law: KnottedLaw, several: Several
+    ) -> tuple[KnottedLaw, float, float]:
         """Time law and κ under which a match leads several from their own starts most nearly along; and how nearly.
 
         The last is the mean distance in sizes of the motion.
         """
         trial = self.try_out(candidate.layers, law, self.plan.trial_contraction)
         progress = trial.progress(torch.from_numpy(several.strands)).numpy()
-        pooled = PiecewiseLinearLaw.pooled(progress, several.arrivals)
+        pooled = KnottedLaw.pooled(progress, several.arrivals)
         misses = {}
         for kappa in self.plan.contractions if self.contraction is None else (self.contraction,):
             misses[kappa] = several.missed_by(self.try_out(candidate.layers, pooled, kappa), self.plan.n_times)
@@ -339,9 +339,7 @@ class Search:
         kappa = min((kappa for kappa, miss in misses.items() if miss <= enough), default=self.plan.trial_contraction)
         return pooled, kappa, misses.get(kappa, math.inf)
 
-    def _search_deeper(
-        self, first: Candidate, path: Array, law: PiecewiseLinearLaw
-    ) -> tuple[Candidate, tuple[str, ...]]:
+    def _search_deeper(self, first: Candidate, path: Array, law: KnottedLaw) -> tuple[Candidate, tuple[str, ...]]:
         """The match that was found, or a deeper one, the first that follows the path; what stood in the way if none."""
         plan, shown = self.plan, self.shape
         fine, way, times = arc_length_path(shown.positions.numpy(), shown.times.numpy(), plan.dense_points)

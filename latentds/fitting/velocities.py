@@ -12,7 +12,7 @@ from torch import Tensor
 from ..arguments import Array
 from ..curves import interpolated
 from ..dynamics import TubeDynamics
-from ..time_law import BEGINS_WITHIN, PiecewiseLinearLaw
+from ..time_law import BEGINS_WITHIN, KnottedLaw
 from ..translations import Layers, LocallyWeightedTranslations
 
 WIDE_LAYERS, WIDTH = 20, 0.4
@@ -73,14 +73,14 @@ def with_wide_layers(layers: Layers, shown: Shown, size: float) -> Layers:
     return Layers(*(np.concatenate(parts) for parts in zip(layers, wide, strict=True)))
 
 
-def learned(ds: Fitted, shown: Shown, n_wide: int) -> Iterator[tuple[Layers, PiecewiseLinearLaw]]:
+def learned(ds: Fitted, shown: Shown, n_wide: int) -> Iterator[tuple[Layers, KnottedLaw]]:
     """Layers and time law that bring a system nearer to velocities shown: by all that can be learned, then by less.
 
     Its last ``n_wide`` layers and its time law are moved, by L-BFGS and in place; the others stay.
     """
     psi, given = ds.diffeomorphism, ds.dynamics.law
-    assert isinstance(given, PiecewiseLinearLaw)
-    law = ds.dynamics.law = PiecewiseLinearLaw(given.knots, given.speeds)  # candidates share the one that was given
+    assert isinstance(given, KnottedLaw)
+    law = ds.dynamics.law = KnottedLaw(given.knots, given.speeds)  # candidates share the one that was given
     first, start = law.speeds.log(), psi.log_widths.detach().clone()
     log_speeds = first.clone().requires_grad_()
     scale = shown.velocities.square().sum(1).mean().sqrt()
@@ -114,4 +114,4 @@ def learned(ds: Fitted, shown: Shown, n_wide: int) -> Iterator[tuple[Layers, Pie
             psi.strengths[-n_wide:] = share * strengths[-n_wide:]
             parts = (part.detach().numpy().copy() for part in (psi.centers, psi.directions, psi.widths))
             speeds = (first + share * (log_speeds.detach() - first)).exp()
-            yield Layers(*parts), PiecewiseLinearLaw(law.knots, speeds)
+            yield Layers(*parts), KnottedLaw(law.knots, speeds)

@@ -146,28 +146,28 @@ def _is_eigenmap(law: Array) -> Any:
 @numba.njit(inline="always", **OPTIONS)  # type: ignore[untyped-decorator]
 def _rate(law: Array, s: Any) -> Any:
     """h(s)/s of the laws in :mod:`latentds.time_law`."""
-    knots, speeds, last = law[1], law[2], law.shape[1] - 1
     if _is_eigenmap(law):
         s = max(s, LINEAR_BELOW)
-        return speeds[0] * (np.sqrt((2.0 - s) / s) if s < 1.0 else 1.0 / s)
-    if s <= knots[0]:
-        return speeds[0] / knots[0]
-    if s >= knots[last]:
-        return speeds[last] / s
-    i = np.searchsorted(knots, s)
-    share = (s - knots[i - 1]) / (knots[i] - knots[i - 1])
-    return (speeds[i - 1] + share * (speeds[i] - speeds[i - 1])) / s
+        return law[2, 0] * (np.sqrt((2.0 - s) / s) if s < 1.0 else 1.0 / s)
+    i = _piece(law, s)
+    if i == 0:
+        return law[3, 0]
+    ahead = min(s, law[1, -1]) - law[1, i]
+    return (law[2, i] + ahead * (law[3, i] + ahead * law[4, i])) / s
 
 
 @numba.njit(inline="always", **OPTIONS)  # type: ignore[untyped-decorator]
 def _slope(law: Array, s: Any) -> Any:
-    """h'(s) of them; at a knot, that of the side where s is smaller."""
-    knots, speeds, last = law[1], law[2], law.shape[1] - 1
-    if s <= (LINEAR_BELOW if _is_eigenmap(law) else knots[0]):
-        return _rate(law, s)
+    """h'(s) of them."""
     if _is_eigenmap(law):
-        return speeds[0] * (1.0 - s) / np.sqrt(s * (2.0 - s)) if s < 1.0 else 0.0
-    if s > knots[last]:
-        return 0.0
-    i = np.searchsorted(knots, s)
-    return (speeds[i] - speeds[i - 1]) / (knots[i] - knots[i - 1])
+        if s <= LINEAR_BELOW:
+            return _rate(law, s)
+        return law[2, 0] * (1.0 - s) / np.sqrt(s * (2.0 - s)) if s < 1.0 else 0.0
+    i = _piece(law, s)
+    return law[3, i] + 2.0 * law[4, i] * (min(s, law[1, -1]) - law[1, i])
+
+
+@numba.njit(inline="always", **OPTIONS)  # type: ignore[untyped-decorator]
+def _piece(law: Array, s: Any) -> Any:
+    """Which piece of a knotted law s lies on."""
+    return max(np.searchsorted(law[1], s) - 1, 0)

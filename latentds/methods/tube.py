@@ -16,7 +16,7 @@ from ..demonstration import Demonstration, goal_apart
 from ..dynamics import TubeDynamics
 from ..fitting.embedding import arc_length_path
 from ..fitting.search import PLAN, Search, Several, refuse_crossings
-from ..time_law import PiecewiseLinearLaw
+from ..time_law import KnottedLaw
 from ..translations import Layers, LocallyWeightedTranslations
 
 DECIMALS = 9
@@ -24,7 +24,8 @@ DECIMALS = 9
 TUBE_RADIUS = 0.02
 """Of the tube that the report speaks of, in lengths of the latent line."""
 PULL_GROWS_WITHIN = 0.25
-"""Distance from the axis, in sizes of the motion, beyond which the inward pull stops growing."""
+"""Distance from the axis, in sizes of the motion, about which the inward pull stops growing: from half to one and a half
+of it, as the law's corner there is round."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ class TubeDS(LatentDS):
         refined: bool = True,
         homotopy: str = "both",
     ) -> None:
-        along, across = PiecewiseLinearLaw.uniform(), PiecewiseLinearLaw(torch.ones(1), torch.ones(1))
+        along, across = KnottedLaw.uniform(), KnottedLaw(torch.ones(1), torch.ones(1))
         psi = LocallyWeightedTranslations(dim, 1 if n_layers is None else n_layers, any_number=n_layers is None)
         super().__init__(dim, psi, TubeDynamics(along, across))
         self.n_layers = None if n_layers is None else psi.n_layers
@@ -110,7 +111,7 @@ class TubeDS(LatentDS):
         origin, unit = motion.goal.numpy(), motion.size
         shape = Demonstration(((motion.positions - motion.goal) / unit).round(decimals=DECIMALS), motion.dt)
 
-        def try_out(layers: Layers, law: PiecewiseLinearLaw, kappa: float) -> TubeDS:
+        def try_out(layers: Layers, law: KnottedLaw, kappa: float) -> TubeDS:
             trial = TubeDS(self.dim)
             trial._assign(layers, shape, law, kappa)
             return trial
@@ -132,14 +133,14 @@ class TubeDS(LatentDS):
         return Learned(best.mse(path), self.diffeomorphism.n_layers, notes=match.notes, details=details)
 
     @torch.no_grad()
-    def _assign(self, layers: Layers, motion: Demonstration, law: PiecewiseLinearLaw, kappa: float) -> None:
+    def _assign(self, layers: Layers, motion: Demonstration, law: KnottedLaw, kappa: float) -> None:
         """Take a match, and the dynamics for it."""
         self.diffeomorphism.assign(*(torch.from_numpy(part) for part in layers))
         self.attractor.copy_(motion.goal)
         self.start.copy_(motion.start)
         reach = torch.as_tensor(PULL_GROWS_WITHIN * motion.size) / self.frame().length.cpu()
         self.dynamics.law = law.to(self.attractor)
-        transverse = PiecewiseLinearLaw(reach.reshape(1), (reach * kappa / motion.duration).reshape(1))
+        transverse = KnottedLaw(reach.reshape(1), (reach * kappa / motion.duration).reshape(1))
         self.dynamics.transverse_law = transverse.to(self.attractor)
 
     def progress(self, y: Tensor) -> Tensor:

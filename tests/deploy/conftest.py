@@ -8,18 +8,18 @@ import torch
 
 from latentds import LatentDS, LocallyWeightedTranslations
 from latentds.dynamics import RayDynamics, TubeDynamics
-from latentds.time_law import ChebyshevLaw, PiecewiseLinearLaw
+from latentds.time_law import ChebyshevLaw, KnottedLaw
 
 DYNAMICS = {
     "ray, eigenmap": lambda: RayDynamics(ChebyshevLaw(2.0)),
-    "ray, uniform": lambda: RayDynamics(PiecewiseLinearLaw.uniform(2.0)),
-    "tube, demonstrated": lambda: TubeDynamics(demonstrated(), PiecewiseLinearLaw(torch.ones(1), torch.ones(1))),
+    "ray, uniform": lambda: RayDynamics(KnottedLaw.uniform(2.0)),
+    "tube, demonstrated": lambda: TubeDynamics(demonstrated(), KnottedLaw(torch.ones(1), torch.ones(1))),
     "tube, eigenmap": lambda: TubeDynamics(ChebyshevLaw(0.5), demonstrated()),
 }
 
 
 def demonstrated():
-    return PiecewiseLinearLaw(torch.tensor([0.1, 0.4, 0.7, 1.0]), torch.tensor([0.2, 0.5, 0.3, 1.0]))
+    return KnottedLaw(torch.tensor([0.1, 0.4, 0.7, 1.0]), torch.tensor([0.2, 0.5, 0.3, 1.0]))
 
 
 class Field(LatentDS):

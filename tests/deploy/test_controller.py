@@ -15,14 +15,14 @@ from baselines import FDM, SDSEF
 from latentds import ChebyshevDS, LatentDS, Learned, LocallyWeightedTranslations
 from latentds.dynamics import TubeDynamics
 from latentds.testing import wavy_motion
-from latentds.time_law import ChebyshevLaw, PiecewiseLinearLaw
+from latentds.time_law import ChebyshevLaw, KnottedLaw
 
 
 class Tube(LatentDS):
     """Every law of the package: a demonstrated one along the axis and a pull to it across."""
 
     def __init__(self, dim):
-        along = PiecewiseLinearLaw(torch.tensor([0.1, 0.4, 0.7, 1.0]), torch.tensor([0.2, 0.5, 0.3, 1.0]))
+        along = KnottedLaw(torch.tensor([0.1, 0.4, 0.7, 1.0]), torch.tensor([0.2, 0.5, 0.3, 1.0]))
         super().__init__(dim, LocallyWeightedTranslations(dim, 30), TubeDynamics(along, ChebyshevLaw(0.2)))
 
     def _learn(self, shown, progress):
