@@ -24,8 +24,8 @@ DECIMALS = 9
 TUBE_RADIUS = 0.02
 """Of the tube that the report speaks of, in lengths of the latent line."""
 PULL_GROWS_WITHIN = 0.25
-"""Distance from the axis, in sizes of the motion, about which the inward pull stops growing: from half to one and a half
-of it, as the law's corner there is round."""
+"""Distance from the axis, in sizes of the motion, about which the inward pull stops growing: from half of it to one and
+a half, as the law's corner there is round."""
 
 
 @dataclass(frozen=True)
