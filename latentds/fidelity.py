@@ -22,7 +22,7 @@ MISS_LIMIT = 0.05
 """Largest mean distance from the demonstration, in its sizes; good fits stay below half of it, even of 1 % noise."""
 END_LIMIT, SPREAD_LIMIT = 0.05, 0.1
 """Largest distance from the demonstrated end when the demonstration ends, in sizes of the motion; and how much more is
-allowed at most where the goals of several demonstrations differ."""
+allowed at most where the goals, or the paces, of several demonstrations differ."""
 LEAST_LENGTH_RATIO, LARGEST_LENGTH_RATIO = 0.8, 1.25
 """Length of the motion over that of the demonstration: a shortcut is shorter, a detour longer."""
 NEARBY_DISTANCE, NEARBY_LIMIT = 0.01, 0.15
@@ -144,6 +144,8 @@ class Fidelity:
         latent_error: see :meth:`~latentds.LatentDS.latent_error`; 0 for a system without latent space.
         spread: of several demonstrations, the largest distance of a goal from the mean of their goals, in sizes. One
             attractor cannot be nearer to all of them, so it is added, up to ``SPREAD_LIMIT``, to what ``end`` may be.
+        pace_spread: of several, the largest mean distance of one from their mean at equal shares of their durations, in
+            sizes. No one timing is nearer to all, so it is added, up to ``SPREAD_LIMIT``, to what ``timing`` may be.
         shown: what it was held against.
     """
 
@@ -160,12 +162,18 @@ class Fidelity:
     command: float = 0.0
     latent_error: float = 0.0
     spread: float = 0.0
+    pace_spread: float = 0.0
     shown: tuple[Excerpt, ...] = field(default=(), repr=False)
 
     @property
     def end_limit(self) -> float:
         """What ``end`` may be."""
         return END_LIMIT + min(self.spread, SPREAD_LIMIT)
+
+    @property
+    def timing_limit(self) -> float:
+        """What ``timing`` may be."""
+        return TIMING_LIMIT + min(self.pace_spread, SPREAD_LIMIT)
 
     @property
     def follows(self) -> bool:
@@ -205,7 +213,7 @@ class Fidelity:
              "misses by {} of the size from a start beside the demonstrated one"),
             (self.end_limit, self.end, "distance of its end from the demonstrated one, in sizes",
              "is {} of the size from the end when the demonstration ends"),
-            (TIMING_LIMIT, self.timing, "distance at equal times, on average, in sizes",
+            (self.timing_limit, self.timing, "distance at equal times, on average, in sizes",
              "is {} of the size from where its demonstration is at the same time, on average"),
             (COMMAND_LIMIT, self.command, "largest speed from the shown start, over the largest shown",
              "moves {} times as fast as shown from where it was shown to begin or from beside it"),
@@ -265,8 +273,12 @@ def measure(ds: System, shown: Sequence[Excerpt]) -> Fidelity:
     for name in ("command", "fastest"):
         figures[name] /= max(one.fastest for one in shown)
     goals = np.stack([path[-1] for path in paths])
-    spread = np.linalg.norm(goals - goals.mean(0), axis=1) / [extent(path) for path in paths]
-    return Fidelity(**figures, spread=float(spread.max()), shown=tuple(shown))
+    sizes = np.array([extent(path) for path in paths])
+    spread = np.linalg.norm(goals - goals.mean(0), axis=1) / sizes
+    shares = np.linspace(0, 1, EXCERPT_POINTS)
+    paced = np.stack([interpolated(shares, np.linspace(0, 1, len(path)), path) for path in paths])
+    pace_spread = np.linalg.norm(paced - paced.mean(0), axis=-1).mean(1) / sizes
+    return Fidelity(**figures, spread=float(spread.max()), pace_spread=float(pace_spread.max()), shown=tuple(shown))
 
 
 def _timing_gap(motion: Array, lasts: float, path: Array, duration: float) -> float:

@@ -570,6 +570,21 @@ def test_goals_that_differ_are_allowed_for_at_the_end_alone_and_not_without_boun
     assert TubeDS(2, n_layers=40, refined=False).fit(shown[:1]).fit_report.fidelity.spread == 0
 
 
+def test_paces_that_differ_are_allowed_for_in_the_timing_alone():
+    """One hurries at first, the other at last: at equal times they are apart, and no field has both their times."""
+    base, share = wavy_motion(2), np.linspace(0, 1, 400)
+    shown = [Demonstration(base.at(base.duration * share**power), base.duration / 399) for power in (0.85, 1 / 0.85)]
+    halves = [one.at(np.linspace(0, one.duration, 200)) for one in shown]
+    apart = np.linalg.norm(halves[0] - halves[1], axis=1).mean() / 2 / shown[0].size
+    fidelity = TubeDS(2, n_layers=40, refined=False).fit(shown).fit_report.fidelity
+    assert fidelity.pace_spread == pytest.approx(apart, rel=1e-2)
+    assert fidelity.timing_limit == pytest.approx(TIMING_LIMIT + apart, rel=1e-2)
+    assert replace(fidelity, pace_spread=9.0).timing_limit == TIMING_LIMIT + SPREAD_LIMIT
+    assert any("at the same time" in note for note in replace(fidelity, timing=TIMING_LIMIT + 2 * apart).notes)
+    assert not any("at the same time" in note for note in replace(fidelity, timing=TIMING_LIMIT + apart / 2).notes)
+    assert TubeDS(2, n_layers=40, refined=False).fit(shown[:1]).fit_report.fidelity.pace_spread == 0
+
+
 @pytest.mark.parametrize("factor", [0.7, 1, 1.4, 5])
 @pytest.mark.parametrize("shown", [wavy_motion(3), datasets.unstable_spiral(3, 300)], ids=["wave", "spiral"])
 def test_a_motion_that_is_too_fast_or_too_slow_does_not_follow(shown, factor):
