@@ -23,6 +23,8 @@ DECIMALS = 9
 """To which the motion is rounded, in its own sizes."""
 TUBE_RADIUS = 0.02
 """Of the tube that the report speaks of, in lengths of the latent line."""
+WILD_CONDITION = 1000.0
+"""cond(J) along the path above which a note tells of it."""
 PULL_GROWS_WITHIN = 0.25
 """Distance from the axis, in sizes of the motion, about which the inward pull stops growing: from half of it to one and
 a half, as the law's corner there is round."""
@@ -125,12 +127,17 @@ class TubeDS(LatentDS):
         best, path = match.candidate.placed(origin, unit), origin + unit * path
         self._assign(best.layers, motion, match.law, match.contraction)
         self._refuse_folds(motion)
-        details = self._conditioning(path, motion) | {
+        conditioning = self._conditioning(path, motion)
+        details = conditioning | {
             "homotopy": best.homotopy,
             "spread": tuple(float(value) for value in strands.std(0).mean(0)),
             "contraction": match.contraction,
         }
-        return Learned(best.mse(path), self.diffeomorphism.n_layers, notes=match.notes, details=details)
+        notes, condition = match.notes, conditioning["condition_path"]
+        if not condition <= WILD_CONDITION:
+            words = f"its map stretches space unevenly, cond(J) is up to {condition:.2g} along the path"
+            notes += (f"{words}: do not rely on what lies beside",)
+        return Learned(best.mse(path), self.diffeomorphism.n_layers, notes=notes, details=details)
 
     @torch.no_grad()
     def _assign(self, layers: Layers, motion: Demonstration, law: KnottedLaw, kappa: float) -> None:

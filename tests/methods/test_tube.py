@@ -371,6 +371,8 @@ def test_a_planar_spiral_takes_as_many_layers_as_it_needs(turns):
     assert ds.n_layers is None
     assert ds.fit_report.n_layers == ds.diffeomorphism.n_layers > 300
     assert follows(ds, shown)
+    told = any(note.startswith("its map stretches space unevenly") for note in ds.fit_report.notes)
+    assert told == (ds.fit_report.condition_path > 1000)
 
 
 @pytest.mark.slow
