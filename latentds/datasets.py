@@ -9,8 +9,8 @@ from contextlib import redirect_stdout
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
-from scipy.interpolate import CubicSpline
 
 from .arguments import number_in, whole_number
 from .curves import arc_lengths, interpolated
@@ -103,7 +103,7 @@ def joint_motion(seed: int, n_points: int = 1000) -> Demonstration:
     postures = random.uniform(-0.6, 0.6, (6, 7)) * JOINT_LIMITS
     duration = float(random.uniform(8, 12))
     times = duration * np.concatenate([[0.0], np.cumsum(random.uniform(0.7, 1.3, 5))])
-    curve = CubicSpline(times / times[-1], postures, bc_type="clamped")
+    curve = scipy.interpolate.CubicSpline(times / times[-1], postures, bc_type="clamped")
     positions = curve(np.linspace(0, 1, count))
     over = np.abs(positions).max(axis=0) / (0.95 * JOINT_LIMITS)
     return Demonstration(positions / np.maximum(over, 1), duration / (count - 1), f"arm {seed}")
@@ -126,7 +126,7 @@ def drawn(name: str, n_points: int = 1000) -> Demonstration:
     chords = arc_lengths(pen)
     share = np.linspace(0, 1, count)
     eased = share**3 * (10 - 15 * share + 6 * share**2)  # least jerk from rest to rest
-    return Demonstration(CubicSpline(chords, pen)(eased * chords[-1]), 4 / (count - 1), name)
+    return Demonstration(scipy.interpolate.CubicSpline(chords, pen)(eased * chords[-1]), 4 / (count - 1), name)
 
 
 def spiral_suite(n_points: int = 1000) -> list[Demonstration]:

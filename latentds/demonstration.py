@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
-from scipy.signal import savgol_filter
 from torch import Tensor
 
 from . import files, recordings
@@ -300,7 +300,7 @@ class Demonstration:
             raise ValueError(f"seconds: expected {least:.3g} to {self.duration:.3g}, got {asked:.3g}")
         half = max(1, min(round(asked / self.dt / 2), (len(self) - 1) // 2))
         points = self.positions.numpy()
-        smooth = savgol_filter(points, 2 * half + 1, min(3, 2 * half), axis=0)
+        smooth = scipy.signal.savgol_filter(points, 2 * half + 1, min(3, 2 * half), axis=0)
         fade = np.maximum(0, 1 - np.arange(len(points)) / half)[:, None]
         smooth += fade * (points[0] - smooth[0]) + fade[::-1] * (points[-1] - smooth[-1])
         smooth[[0, -1]] = points[[0, -1]]

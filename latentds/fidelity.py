@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
+import scipy
 import torch
-from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from .arguments import Array, number_in, point_array, positive
@@ -295,7 +295,7 @@ def _worst_coordinate(motion: Array, path: Array, still: float) -> float:
     Missed where the motion is nearest in all coordinates together, which those of the largest unit decide.
     """
     ranges = np.ptp(path, axis=0)
-    apart = motion[cdist(path, motion).argmin(1)] - path
+    apart = motion[scipy.spatial.distance.cdist(path, motion).argmin(1)] - path
     missed = np.abs(apart).mean(0)[ranges > still] / ranges[ranges > still]
     return float(np.max(missed, initial=0.0))
 

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter, uniform_filter1d
-from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from .arguments import Array
@@ -250,7 +249,7 @@ def _times(times: float) -> str:
 
 def _usual(steps: Array) -> Array:
     """What the neighbours of each step move: the larger median of the five before and after it, but for the nearest."""
-    middle = median_filter(steps, (5, *[1] * (steps.ndim - 1)), mode="nearest")
+    middle = scipy.ndimage.median_filter(steps, (5, *[1] * (steps.ndim - 1)), mode="nearest")
     before, after = np.zeros_like(steps), np.zeros_like(steps)
     before[5:], after[:-5] = middle[:-5], middle[5:]
     usual: Array = np.maximum(before, after)
@@ -259,7 +258,7 @@ def _usual(steps: Array) -> Array:
 
 def _calm(points: Array) -> Array:
     """Means over a hundredth of the rows: noise is less, sways remain."""
-    calm: Array = uniform_filter1d(points, max(1, len(points) // 100), axis=0, mode="nearest")
+    calm: Array = scipy.ndimage.uniform_filter1d(points, max(1, len(points) // 100), axis=0, mode="nearest")
     return calm
 
 
@@ -483,7 +482,7 @@ def _meetings(points: Array, offset: int, size: float, hidden: bool) -> Iterator
         )
     elif not hidden and len(points) > LEAST_ROWS and points.shape[1] > 1:
         curve = evenly_resampled(points, STRAND_POINTS)
-        apart = cdist(curve, curve)
+        apart = scipy.spatial.distance.cdist(curve, curve)
         between = np.maximum.accumulate(np.triu(apart), axis=1)
         spacing = float(step_lengths(curve).max())
         first, second = np.nonzero(np.triu((between > AWAY * size) & (apart < NEAR * size + 2 * spacing), 2))

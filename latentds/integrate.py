@@ -14,18 +14,31 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable
-from functools import reduce
+from functools import cache, reduce
+from typing import NamedTuple
 
+import scipy
 import torch
-from scipy.integrate import RK45
 from torch import Tensor
 
 from .arguments import refuse_tracing
 
-_STAGES = [*(RK45.A[stage, :stage].tolist() for stage in range(1, 6)), RK45.B.tolist()]  # the last is the step's end
-_ERROR = RK45.E.tolist()
-_INTERPOLANT = torch.from_numpy(RK45.P.T[::-1].copy())
-"""The slopes' weights, by falling powers of the share of the step."""
+
+class _Pair(NamedTuple):
+    """Coefficients of the pair, read when a field is first integrated: they cost a quarter of a second to import."""
+
+    stages: list[list[float]]
+    """the last is the step's end"""
+    error: list[float]
+    interpolant: Tensor
+    """the slopes' weights, by falling powers of the share of the step"""
+
+
+@cache
+def _pair() -> _Pair:
+    rk = scipy.integrate.RK45
+    stages = [*(rk.A[stage, :stage].tolist() for stage in range(1, 6)), rk.B.tolist()]
+    return _Pair(stages, rk.E.tolist(), torch.from_numpy(rk.P.T[::-1].copy()))
 
 
 def integrate(
@@ -92,7 +105,7 @@ def integrate(
             h = (0.01 * distance / slope.detach().abs().amax(-1)).to(t).nan_to_num(0.0, posinf=float(clock[-1]))
         with torch.no_grad():
             end, slopes = _step(velocity, y, slope, h)
-            error = h * _sum(_ERROR, slopes).detach().abs().amax(-1) / tolerance
+            error = h * _sum(_pair().error, slopes).detach().abs().amax(-1) / tolerance
         error = error.nan_to_num(torch.inf)
         accepted = error <= 1
         if tracked:  # once more, as a graph without rejected steps: one that is not finite would spoil every gradient
@@ -120,7 +133,7 @@ def integrate(
 def _step(velocity: Callable[[Tensor], Tensor], y: Tensor, slope: Tensor, h: Tensor) -> tuple[Tensor, list[Tensor]]:
     """The state h (m,) seconds after y (m, n), where the velocity is ``slope``, and the seven slopes of that step."""
     slopes, end = [slope], y
-    for weights in _STAGES:
+    for weights in _pair().stages:
         end = y + h[:, None].to(y.dtype) * _sum(weights, slopes)
         slopes.append(velocity(end))
     return end, slopes
@@ -129,7 +142,7 @@ def _step(velocity: Callable[[Tensor], Tensor], y: Tensor, slope: Tensor, h: Ten
 def _moved(h: Tensor, share: Tensor, slopes: list[Tensor]) -> Tensor:
     """How far the state has come (m, n) after a share in (0, 1] of a step of h seconds, both (m,)."""
     weights = torch.zeros((), dtype=h.dtype)
-    for coefficients in _INTERPOLANT.to(h):
+    for coefficients in _pair().interpolant.to(h):
         weights = (weights + coefficients) * share[:, None]
     return _sum((weights * h[:, None]).to(slopes[0]).T[..., None], slopes)
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
+import scipy
 import torch
-from scipy.integrate import cumulative_simpson
 from torch import Tensor
 
 from .arguments import Array
@@ -65,7 +65,9 @@ def flow_gap(ds: Moving, y0: Tensor, times: Tensor, enough: float) -> Tensor:
             break
         clock = torch.linspace(0, float(times[-1] - times[0]), finer * (len(times) - 1) + 1, dtype=times.dtype)
         motions = ds.rollout(y0, clock.to(times))
-        passed = cumulative_simpson(ds(motions).double().cpu().numpy(), x=clock.numpy(), axis=-2, initial=0)
+        passed = scipy.integrate.cumulative_simpson(
+            ds(motions).double().cpu().numpy(), x=clock.numpy(), axis=-2, initial=0
+        )
         missed = motions - motions[..., :1, :] - torch.from_numpy(passed).to(motions)
         gaps: Tensor = torch.linalg.vector_norm(missed, dim=-1).amax(-1)
         # What the rule misses at a kink is at most a quarter of what it missed at a quarter of the points.

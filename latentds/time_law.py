@@ -7,8 +7,8 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
-from scipy.ndimage import gaussian_filter1d
 from torch import Tensor, nn
 
 from .arguments import Array, positive
@@ -190,7 +190,7 @@ class KnottedLaw(TimeLaw):
         others = np.where(begins, 0.0, ways).sum(0) > 0
         counted = ~(begins & others)
         way, took = (np.where(counted, part, 0.0).sum(0) for part in (ways, taken))
-        way, took = (gaussian_filter1d(part, POOLED_WIDTH, mode="nearest") for part in (way, took))
+        way, took = (scipy.ndimage.gaussian_filter1d(part, POOLED_WIDTH, mode="nearest") for part in (way, took))
         middle, seen = (edges[1:] + edges[:-1]) / 2, took > 0
         mean = float((1 / times[:, -1]).mean())
         speeds = np.maximum(np.interp(middle, middle[seen], way[seen] / took[seen]), SLOWEST * mean)

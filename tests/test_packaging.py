@@ -85,3 +85,10 @@ def test_a_bare_install_saves_and_loads(installed, tmp_path):
     needs = message_from_string(metadata.read_text(encoding="utf-8")).get_all("Requires-Dist")
     assert any(need.startswith("safetensors") and "extra" not in need for need in needs)
     run(sys.executable, "-I", "-c", BARE, installed, cwd=tmp_path)
+
+
+def test_an_import_waits_for_no_part_of_scipy():
+    """Each is loaded when it is first used: together they take a second that most sessions do not need."""
+    loaded = run(sys.executable, "-c", "import sys, torch, latentds; print(*sys.modules)", cwd=ROOT).split()
+    assert "latentds" in loaded
+    assert not {"scipy.stats", "scipy.signal", "scipy.optimize", "scipy.integrate", "scipy.ndimage"} & {*loaded}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d, minimum_filter1d
+import scipy
 
 from ..arguments import Array
 from ..curves import directions_along, extent, step_lengths, transported_frames
@@ -93,7 +93,9 @@ def smoothed(path: Array) -> Array:
     count = len(path)
     pad = min(count - 1, int(4 * width) + 1)
     before, after = 2 * path[0] - path[pad:0:-1], 2 * path[-1] - path[-2 : -2 - pad : -1]
-    averaged: Array = gaussian_filter1d(np.concatenate([before, path, after]), width, axis=0)[pad : pad + count]
+    averaged: Array = scipy.ndimage.gaussian_filter1d(np.concatenate([before, path, after]), width, axis=0)[
+        pad : pad + count
+    ]
     return averaged
 
 
@@ -105,7 +107,7 @@ def radius(path: Array, smooth: Array, wanted: float) -> Array:
     bends = np.linalg.norm(np.gradient(tangents / speeds[:, None], axis=0), axis=1) / speeds
     most = np.minimum(SHARE_OF_CLEARANCE * clearance, SHARE_OF_CURVATURE_RADIUS / np.maximum(bends, 1e-12 / wanted))
     near = max(1, len(path) // 60)
-    most = gaussian_filter1d(minimum_filter1d(most, 2 * near + 1), near, mode="nearest")
+    most = scipy.ndimage.gaussian_filter1d(scipy.ndimage.minimum_filter1d(most, 2 * near + 1), near, mode="nearest")
     radii: Array = np.minimum(np.clip(most, LEAST_RADIUS_SHARE * wanted, wanted), SHARE_OF_CLEARANCE * clearance)
     return radii
 

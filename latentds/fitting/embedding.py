@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.optimize import brentq
+import scipy
 
 from ..arguments import Array, whole_number
 from ..curves import evenly_resampled, extent, jitter, progress_along
@@ -63,7 +63,9 @@ def _angles(n_points: int, dim: int) -> Array:
     def last_row(theta: float, j: int) -> float:
         return math.cos((n + 0.5) * theta) - (2 * math.cos(2 * math.pi * j / copies) - 1) * math.cos((n - 0.5) * theta)
 
-    return np.array([brentq(last_row, 0, edge, args=(j,), xtol=1e-18, rtol=1e-15) for j in range(1, copies)])
+    return np.array(
+        [scipy.optimize.brentq(last_row, 0, edge, args=(j,), xtol=1e-18, rtol=1e-15) for j in range(1, copies)]
+    )
 
 
 def arc_length_path(positions: Array, times: Array, n_points: int) -> tuple[Array, Array, Array]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import minimize
+import scipy
 
 from ..arguments import Array
 from ..kernels.translations import forward_and_adjoint
@@ -60,6 +60,6 @@ def refine(layers: Layers, x: Array, y: Array, mu: float, *, weights: Array | No
         return layers
     scale = 1 / before
     options = {"maxiter": steps, "maxfun": 2 * steps, "maxcor": 20, "ftol": 1e-12, "gtol": 1e-10}
-    minimum = minimize(loss, start, jac=True, method="L-BFGS-B", options=options)
+    minimum = scipy.optimize.minimize(loss, start, jac=True, method="L-BFGS-B", options=options)
     centers, _, _, widths, directions = unpack(minimum.x)
     return Layers(centers, directions, widths)
