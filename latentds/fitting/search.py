@@ -235,7 +235,8 @@ class Search:
     @torch.no_grad()
     def run(self) -> Match:
         path, law = self.path_and_law
-        best = self._best_of_few(path, law)
+        few = self._few(path, law)
+        best = few[0] if self.several is None else next((c for c in few if self._off(self._trial(c, law)) <= 1), few[0])
         notes: tuple[str, ...] = ()
         if self.n_layers is None:
             best, notes = self._search_deeper(best, path, law)
@@ -253,12 +254,16 @@ class Search:
         shown = Shown.of(several.strands, several.arrivals, self.plan.n_times)
         more = with_wide_layers(best.layers, shown, self.shape.size)
         n_wide = len(more.widths) - len(best.layers.widths)
+        allowed = max(1.0, self._off(self.try_out(best.layers, law, kappa)))
         for layers, own in learned(self.try_out(more, law, kappa), shown, n_wide):
-            if several.missed_by(self.try_out(layers, own, kappa), self.plan.n_times) <= self.plan.gentle * missed:
+            trial = self.try_out(layers, own, kappa)
+            as_near = several.missed_by(trial, self.plan.n_times) <= self.plan.gentle * missed
+            if as_near and self._off(trial) <= allowed:
                 return best._replace(layers=layers), own
         return best, law
 
-    def _best_of_few(self, path: Array, law: KnottedLaw) -> Candidate:
+    def _few(self, path: Array, law: KnottedLaw) -> list[Candidate]:
+        """The candidates that score within ``close_score`` of the best, the best first."""
         plan, several = self.plan, self.several
         scored = []
         for candidate in self._candidates(path, self.n_layers or plan.n_layers):
@@ -274,7 +279,8 @@ class Search:
                 break
             better = candidate.widened(path, plan.steps) if several else candidate.refined(path)
             scored.append((self._score(better, path, law), better))
-        return min(scored, key=lambda pair: pair[0])[1]
+        scored.sort(key=lambda pair: pair[0])
+        return [candidate for score, candidate in scored if score <= plan.close_score * scored[0][0]] or [scored[0][1]]
 
     def _candidates(self, path: Array, n_layers: int) -> Iterator[Candidate]:
         """Matches of a line to the path (N, n), along either homotopy or the one that is asked for."""
@@ -339,26 +345,44 @@ class Search:
         kappa = min((kappa for kappa, miss in misses.items() if miss <= enough), default=self.plan.trial_contraction)
         return pooled, kappa, misses.get(kappa, math.inf)
 
+    @cached_property
+    def _fine(self) -> tuple[Array, Array, Array]:
+        """The path, dense and even in arc length, how much of the way is left there, and when."""
+        return arc_length_path(self.shape.positions.numpy(), self.shape.times.numpy(), self.plan.dense_points)
+
+    @cached_property
+    def _even(self) -> Array:
+        """Times at which a match is held against the motion."""
+        return np.linspace(0, self._fine[2][-1], 8 * self.plan.n_times)
+
+    @cached_property
+    def _wanted(self) -> tuple[Excerpt, ...]:
+        fine, way, times = self._fine
+        share = np.interp(self._even, times, 1 - way)
+        timed = interpolated(share, np.linspace(0, 1, len(fine)), fine)
+        return (Excerpt.of(Demonstration(torch.from_numpy(timed), float(self._even[1]))),)
+
+    def _trial(self, candidate: Candidate, law: KnottedLaw) -> Trial:
+        """The system of a match, of several demonstrations with their own law and κ."""
+        if self.several is None:
+            return self.try_out(candidate.layers, law, self.plan.trial_contraction)
+        own, kappa, _ = self._choose_law_and_contraction(candidate, law, self.several)
+        return self.try_out(candidate.layers, own, kappa)
+
+    def _off(self, ds: Trial) -> float:
+        """How far a system is from following the path, above 1 if it does not."""
+        fidelity = measure(ds, self._wanted)
+        if self.several is not None:  # whose mean is nobody's motion: it is to be led along, in no time of its own
+            return max(bad for bad, _ in replace(fidelity, timing=0.0).findings)
+        return max(fidelity.miss / self.plan.follows_below, *(bad for bad, _ in fidelity.findings))
+
     def _search_deeper(self, first: Candidate, path: Array, law: KnottedLaw) -> tuple[Candidate, tuple[str, ...]]:
         """The match that was found, or a deeper one, the first that follows the path; what stood in the way if none."""
         plan, shown = self.plan, self.shape
-        fine, way, times = arc_length_path(shown.positions.numpy(), shown.times.numpy(), plan.dense_points)
-        even = np.linspace(0, times[-1], 8 * plan.n_times)
-        share = np.interp(even, times, 1 - way)
-        timed = interpolated(share, np.linspace(0, 1, len(fine)), fine)
-        wanted = (Excerpt.of(Demonstration(torch.from_numpy(timed), float(even[1]))),)
-
-        def trial(candidate: Candidate) -> Trial:
-            if self.several is not None:
-                own, kappa, _ = self._choose_law_and_contraction(candidate, law, self.several)
-                return self.try_out(candidate.layers, own, kappa)
-            return self.try_out(candidate.layers, law, plan.trial_contraction)
+        fine, even = self._fine[0], self._even
 
         def badness(candidate: Candidate) -> float:
-            fidelity = measure(trial(candidate), wanted)
-            if self.several is not None:  # whose mean is nobody's motion: it is to be led along, in no time of its own
-                return max(bad for bad, _ in replace(fidelity, timing=0.0).findings)
-            return max(fidelity.miss / plan.follows_below, *(bad for bad, _ in fidelity.findings))
+            return self._off(self._trial(candidate, law))
 
         hidden = what_hides(shown.positions.numpy(), plan.hidden_above)
         best, least, dense = first, badness(first), crowded(fine, plan.crowded_points)
@@ -367,6 +391,8 @@ class Search:
         for layers, candidate in self._deeper(path, dense) if least > 1 and not hidden else ():
             laid += layers
             if candidate is not None:
+                if self.several is not None and self.refined and len(candidate.line) == len(path):
+                    candidate = candidate.widened(path, plan.first_steps)
                 again.append((badness(candidate), candidate))
             stopped = laid >= plan.layer_budget
             if stopped or (candidate is not None and again[-1][0] <= 1):
@@ -376,7 +402,7 @@ class Search:
                 better = candidate.refined(dense if len(candidate.line) == len(dense) else path, 100)
                 again.append((badness(better), better))
         best, least = min([(least, best), *again], key=lambda pair: pair[0])[::-1]
-        motion = trial(best).rollout(shown.start, torch.from_numpy(even)).numpy()
+        motion = self._trial(best, law).rollout(shown.start, torch.from_numpy(even)).numpy()
         missed = dtw(motion, shown.at(even)) / len(even) / shown.size
         notes = [str(hidden)] if hidden else []
         if least > 1 and not hidden:
