@@ -225,7 +225,10 @@ class StableDS(nn.Module, ABC):
 
     def _learn_and_measure(self, shown: Sequence[Demonstration], progress: bool) -> FitReport:
         began = time.perf_counter()
-        learned = self._learn(shown, progress)
+        # As outside of every mode that the caller is in, but for a system that was made for inference alone.
+        for_inference = any(tensor.is_inference() for tensor in (*self.parameters(), *self.buffers()))
+        with torch.inference_mode(for_inference), torch.set_grad_enabled(not for_inference):
+            learned = self._learn(shown, progress)
         if not isinstance(learned, Learned):
             raise TypeError(f"{type(self).__name__}: expected _learn to return a Learned, got {type(learned).__name__}")
         report = self.report_type(

@@ -274,3 +274,16 @@ def test_two_processes_train_as_one(kind, tmp_path):
         found = torch.load(f"{learned}.{rank}")
         for name, value in wanted.items():
             torch.testing.assert_close(found[name], value, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("mode", [torch.inference_mode, torch.no_grad])
+@pytest.mark.parametrize("several", [False, True])
+def test_a_fit_by_gradients_is_the_same_in_any_mode(mode, several):
+    shown = [wavy_motion(2), wavy_motion(2, seed=1)] if several else wavy_motion(2)
+    fitted = [SDSEF(2, n_layers=2, n_features=8, epochs=3, seed=0) for _ in range(2)]
+    fitted[0].fit(shown)
+    with mode():
+        fitted[1].fit(shown)
+    here, there = (one.state_dict() for one in fitted)
+    assert all(torch.equal(here[name], there[name]) for name in here)
+    assert all(parameter.requires_grad and not parameter.is_inference() for parameter in fitted[1].parameters())

@@ -247,6 +247,7 @@ class Search:
                 best, law = self._with_velocities(best, law, kappa, missed, self.several)
         return Match(best, law, kappa, notes)
 
+    @torch.inference_mode(False)  # type: ignore[untyped-decorator]
     def _with_velocities(
         self, best: Candidate, law: KnottedLaw, kappa: float, missed: float, several: Several
     ) -> tuple[Candidate, KnottedLaw]:

@@ -80,7 +80,8 @@ def learned(ds: Fitted, shown: Shown, n_wide: int) -> Iterator[tuple[Layers, Kno
     """
     psi, given = ds.diffeomorphism, ds.dynamics.law
     assert isinstance(given, KnottedLaw)
-    law = ds.dynamics.law = KnottedLaw(given.knots, given.speeds)  # candidates share the one that was given
+    # Candidates share the law that was given, and inference mode may have made it.
+    law = ds.dynamics.law = KnottedLaw(given.knots.clone(), given.speeds.clone())
     first, start = law.speeds.log(), psi.log_widths.detach().clone()
     log_speeds = first.clone().requires_grad_()
     scale = shown.velocities.square().sum(1).mean().sqrt()

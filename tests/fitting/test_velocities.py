@@ -95,3 +95,11 @@ def test_units_and_origin_of_several_do_not_matter(with_and_without):
     there = TubeDS(2).fit([Demonstration(1000 * one.positions + 17.3, one.dt) for one in arcs()])
     with torch.no_grad():
         assert (there(1000 * y + 17.3) / 1000 - here(y)).norm(dim=-1).max() < 1e-9
+
+
+@pytest.mark.slow
+def test_several_are_learned_alike_in_inference_mode(with_and_without):
+    with torch.inference_mode():
+        ds = TubeDS(2).fit(arcs())
+    for name, part in with_and_without[0].state_dict().items():
+        assert torch.equal(part, ds.state_dict()[name]), name
