@@ -116,4 +116,4 @@ def test_limits_of_fidelity_are_the_ones_that_are_told():
         "command": [fidelity.COMMAND_LIMIT],
         "latent_error": [fidelity.ROUNDING_LIMIT],
     }
-    assert told.keys() == fidelity.Fidelity.__dataclass_fields__.keys() - {"spread", "shown"}
+    assert told.keys() == fidelity.Fidelity.__dataclass_fields__.keys() - {"spread", "pace_spread", "shown"}
