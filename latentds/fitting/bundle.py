@@ -93,10 +93,8 @@ def smoothed(path: Array) -> Array:
     count = len(path)
     pad = min(count - 1, int(4 * width) + 1)
     before, after = 2 * path[0] - path[pad:0:-1], 2 * path[-1] - path[-2 : -2 - pad : -1]
-    averaged: Array = scipy.ndimage.gaussian_filter1d(np.concatenate([before, path, after]), width, axis=0)[
-        pad : pad + count
-    ]
-    return averaged
+    averaged: Array = scipy.ndimage.gaussian_filter1d(np.concatenate([before, path, after]), width, axis=0)
+    return averaged[pad : pad + count]
 
 
 def radius(path: Array, smooth: Array, wanted: float) -> Array:

@@ -73,7 +73,7 @@ class TubeDS(LatentDS):
     Args:
         dim: n >= 1.
         n_layers: M >= 1; None for 300, or as many as it takes to follow the path: see
-            :class:`latentds.fitting.search.Plan`.
+            :class:`latentds.fitting.search.Plan`; and of several, where it is None alone, the wide ones.
         contraction: κ > 0, per duration of the demonstration: a start off the path comes back within about
             3/κ of it. A larger κ costs proportionally larger velocity gradients (see the report). None, the default,
             is 20 for one demonstration, which says nothing about what lies beside it, and for several that one of
