@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from scipy.optimize import minimize
 from torch import Tensor, nn
 
 from latentds.arguments import Array
+from latentds.fitting.lbfgs import minimize
 
 MAX_RECOVERIES = 25
 
@@ -157,7 +157,6 @@ def descend_smoothly(
     Returns:
         The loss after each iteration.
     """
-    history: list[float] = []
     moved = list(parameters)
     sizes = [p.numel() for p in moved]
     steps = torch.cat([torch.full((p.numel(),), step, dtype=p.dtype) for p, step in parameters.items()])
@@ -174,16 +173,9 @@ def descend_smoothly(
         return float(value.detach()), (torch.cat([slope.flatten() for slope in slopes]) * steps).numpy()
 
     begin = (torch.cat([p.detach().flatten() for p in moved]) / steps).numpy()
-    minimum = minimize(
-        evaluate,
-        begin,
-        jac=True,
-        method="L-BFGS-B",
-        callback=lambda intermediate_result: history.append(float(intermediate_result.fun)),
-        options={"maxiter": iterations, "maxfun": 2 * iterations, "maxcor": 20, "ftol": 1e-8, "gtol": 1e-8},
-    )
-    assign(minimum.x)
-    return tuple(history)
+    minimum = minimize(evaluate, begin, steps=iterations, least_change=1e-8)
+    assign(minimum.at)
+    return minimum.history
 
 
 def _adam(parameters: Sequence[nn.Parameter], plan: Plan) -> torch.optim.Adam:

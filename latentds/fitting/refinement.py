@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy
 
 from ..arguments import Array
 from ..kernels.translations import forward_and_adjoint
 from ..translations import WIDTH_BOUND, Layers, directions_of, strengths_of
+from .lbfgs import minimize
 
 
 def refine(layers: Layers, x: Array, y: Array, mu: float, *, weights: Array | None = None, steps: int = 300) -> Layers:
@@ -59,7 +59,5 @@ def refine(layers: Layers, x: Array, y: Array, mu: float, *, weights: Array | No
     if not before > 0:
         return layers
     scale = 1 / before
-    options = {"maxiter": steps, "maxfun": 2 * steps, "maxcor": 20, "ftol": 1e-12, "gtol": 1e-10}
-    minimum = scipy.optimize.minimize(loss, start, jac=True, method="L-BFGS-B", options=options)
-    centers, _, _, widths, directions = unpack(minimum.x)
+    centers, _, _, widths, directions = unpack(minimize(loss, start, steps=steps).at)
     return Layers(centers, directions, widths)

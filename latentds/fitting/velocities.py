@@ -14,6 +14,7 @@ from ..curves import interpolated
 from ..dynamics import TubeDynamics
 from ..time_law import BEGINS_WITHIN, KnottedLaw
 from ..translations import Layers, LocallyWeightedTranslations
+from .lbfgs import minimize
 
 WIDE_LAYERS, WIDTH = 20, 0.4
 """How many layers are added, and 1/ρ of each at first, in sizes of the motion: what is wider than the differences
@@ -83,36 +84,37 @@ def learned(ds: Fitted, shown: Shown, n_wide: int) -> Iterator[tuple[Layers, Kno
     # Candidates share the law that was given, and inference mode may have made it.
     law = ds.dynamics.law = KnottedLaw(given.knots.clone(), given.speeds.clone())
     first, start = law.speeds.log(), psi.log_widths.detach().clone()
-    log_speeds = first.clone().requires_grad_()
     scale = shown.velocities.square().sum(1).mean().sqrt()
     wanted = shown.velocities / scale
-    parameters = [psi.centers, psi.log_widths, psi.strengths, log_speeds]
-    optimizer = torch.optim.LBFGS(
-        parameters, max_iter=STEPS, max_eval=2 * STEPS, history_size=20, line_search_fn="strong_wolfe"
-    )
+    moved = [psi.centers, psi.log_widths, psi.strengths]
+    sizes = [*(part[-n_wide:].numel() for part in moved), len(first)]
 
-    @torch.enable_grad()  # type: ignore[untyped-decorator]
-    def closure() -> Tensor:
-        optimizer.zero_grad()
-        law.speeds = log_speeds.exp()
-        velocities = ds(shown.points) / scale
-        distance = (velocities - wanted).square().sum(1)
-        norms = (velocities.square().sum(1) + AT_REST**2) * (wanted.square().sum(1) + AT_REST**2)
-        loss = (distance + AT_REST**2).sqrt().mean()
-        loss = loss + SHARE_OF_DIRECTION * (1 - (velocities * wanted).sum(1) / norms.sqrt()).mean()
-        moved = psi.strengths[-n_wide:].square().sum() + (psi.log_widths - start).square().sum()
-        loss = loss + KEPT_SMALL * moved + KEPT_SMOOTH * (log_speeds - first).diff().diff().square().sum()
-        loss.backward()  # type: ignore[no-untyped-call]
-        for parameter in parameters[:3]:
-            assert parameter.grad is not None
-            parameter.grad[:-n_wide] = 0
-        return loss
+    def loss(flat: Array) -> tuple[float, Array]:
+        *parts, log_speeds = torch.split(torch.from_numpy(flat), sizes)
+        with torch.no_grad():
+            for parameter, part in zip(moved, parts, strict=True):
+                parameter[-n_wide:] = part.view_as(parameter[-n_wide:])
+        with torch.enable_grad():
+            law.speeds = log_speeds.requires_grad_().exp()
+            velocities = ds(shown.points) / scale
+            distance = (velocities - wanted).square().sum(1)
+            norms = (velocities.square().sum(1) + AT_REST**2) * (wanted.square().sum(1) + AT_REST**2)
+            value = (distance + AT_REST**2).sqrt().mean()
+            value = value + SHARE_OF_DIRECTION * (1 - (velocities * wanted).sum(1) / norms.sqrt()).mean()
+            change = psi.strengths[-n_wide:].square().sum() + (psi.log_widths - start).square().sum()
+            value = value + KEPT_SMALL * change + KEPT_SMOOTH * (log_speeds - first).diff().diff().square().sum()
+            *slopes, of_speeds = torch.autograd.grad(value, [*moved, log_speeds])
+        gradient = torch.cat([*(slope[-n_wide:].flatten() for slope in slopes), of_speeds])
+        return float(value.detach()), gradient.numpy()
 
-    optimizer.step(closure)  # type: ignore[no-untyped-call]
+    flat = torch.cat([*(parameter.detach()[-n_wide:].flatten() for parameter in moved), first])
+    best = minimize(loss, flat.numpy(), steps=STEPS).at
+    loss(best)
+    log_speeds = torch.from_numpy(best[-len(first) :])
     strengths = psi.strengths.detach().clone()
     with torch.no_grad():
         for share in SHARES:
             psi.strengths[-n_wide:] = share * strengths[-n_wide:]
             parts = (part.detach().numpy().copy() for part in (psi.centers, psi.directions, psi.widths))
-            speeds = (first + share * (log_speeds.detach() - first)).exp()
+            speeds = (first + share * (log_speeds - first)).exp()
             yield Layers(*parts), KnottedLaw(law.knots, speeds)

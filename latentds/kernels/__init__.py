@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from .adjoint import forward_adjoint, inverse_adjoint
 from .dispatch import BLOCK
 from .greedy import greedy_kernel
+from .quasi_newton import direction_kernel
 from .translations import forward_kernel, inverse_kernel, pack_kernel
 from .velocity import velocity_kernel
 
@@ -25,3 +26,4 @@ def warmup(dims: Sequence[int] = (2, 3)) -> None:
             velocity_kernel(dim, tangents)
     pack_kernel()
     greedy_kernel()
+    direction_kernel()
