@@ -11,6 +11,9 @@ from torch import Tensor
 
 from .arguments import Array
 
+LINEAR_BELOW = 1e-3
+"""Progress below which laws turn linear, ṡ ∝ -s: a law that reaches the goal in finite time is not Lipschitz there."""
+
 
 class Tabulated:
     """Something that can say its formula in numbers, by :meth:`table`.

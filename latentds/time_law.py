@@ -12,11 +12,10 @@ import torch
 from torch import Tensor, nn
 
 from .arguments import Array, positive
+from .kernels.dispatch import is_plain, no_active_transforms
 from .resizing import make_room
-from .tabulated import LawKind, LawTable, Tabulated, rounded_pieces
+from .tabulated import LINEAR_BELOW, LawKind, LawTable, Tabulated, rounded_pieces
 
-LINEAR_BELOW = 1e-3
-"""Progress below which laws turn linear, ṡ ∝ -s: a law that reaches the goal in finite time is not Lipschitz there."""
 POOLED_CELLS, POOLED_WIDTH = 60, 1.0
 """Cells of the way in which several motions are pooled, and the standard deviation, in cells, that smooths them."""
 BEGINS_WITHIN = 0.06
@@ -199,14 +198,14 @@ class KnottedLaw(TimeLaw):
 
     def speed(self, s: Tensor) -> Tensor:
         pieces = self._pieces()
-        start, speed, slope, bend, _ = pieces[:, torch.bucketize(s.detach(), pieces[0, 1:])]
+        start, speed, slope, bend, _ = pieces[:, _piece_of(s, pieces[0, 1:])]
         ahead = torch.minimum(s, pieces[0, -1]) - start  # h is constant on the last piece, at infinity too
         h: Tensor = speed + ahead * (slope + ahead * bend)
         return h
 
     def time_to_go(self, s: Tensor) -> Tensor:
         pieces = self._pieces()
-        index = torch.bucketize(s.detach(), pieces[0, 1:])
+        index = _piece_of(s, pieces[0, 1:])
         start, *piece = pieces[:, index.clamp(min=1)]
         edge, rate = pieces[0, 1], pieces[2, 0]
         inside = _arrivals(pieces)[index] + _travel_time(torch.where(index == 0, 0.0, s - start), *piece)
@@ -215,7 +214,7 @@ class KnottedLaw(TimeLaw):
     def progress_at(self, time: Tensor) -> Tensor:
         pieces = self._pieces()
         arrivals = _arrivals(pieces)
-        index = torch.bucketize(time.detach(), arrivals[1:])
+        index = _piece_of(time, arrivals[1:])
         start, *piece = pieces[:, index.clamp(min=1)]
         inside = start + _travel(torch.where(index == 0, 0.0, time - arrivals[index]), *piece)
         return torch.where(index == 0, pieces[0, 1] * torch.exp(pieces[2, 0] * time.clamp(max=0.0)), inside)
@@ -261,6 +260,18 @@ def _check_knots(knots: Tensor, speeds: Tensor) -> None:
         raise ValueError(f"knots: expected (m,) finite numbers increasing from above 0, got {knots.tolist()!r:.80}")
     if speeds.shape != knots.shape or not bool(((speeds > 0) & torch.isfinite(speeds)).all()):
         raise ValueError(f"speeds: expected {tuple(knots.shape)} finite numbers > 0, got {speeds.tolist()!r:.80}")
+
+
+def _piece_of(values: Tensor, edges: Tensor) -> Tensor:
+    """How many of the edges lie below each value.
+
+    torch wakes a thread a core for more than 200 values, which then spin for longer than it takes to find them all.
+    """
+    values = values.detach()
+    if values.numel() > 200 and is_plain(values, values.dtype) and no_active_transforms():
+        found = np.searchsorted(edges.detach().numpy(), values.numpy().ravel())
+        return torch.from_numpy(found).view(values.shape)
+    return torch.bucketize(values, edges)
 
 
 def _arrivals(pieces: Tensor) -> Tensor:

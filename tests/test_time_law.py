@@ -11,7 +11,8 @@ from scipy.integrate import quad, solve_ivp
 from scipy.ndimage import gaussian_filter1d
 
 from latentds.dynamics import Frame, RayDynamics
-from latentds.time_law import LINEAR_BELOW, ChebyshevLaw, KnottedLaw
+from latentds.tabulated import LINEAR_BELOW
+from latentds.time_law import ChebyshevLaw, KnottedLaw
 from tests.motions import tensor
 
 

@@ -13,8 +13,7 @@ import torch
 from ..arguments import Array
 from ..files import atomic_write
 from ..kernels.translations import BEYOND
-from ..tabulated import LawKind, LawTable
-from ..time_law import LINEAR_BELOW
+from ..tabulated import LINEAR_BELOW, LawKind, LawTable
 from ..translations import ROOT_STEPS
 from .tables import FieldTables, VelocityField, describe, tables_of
 

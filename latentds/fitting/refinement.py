@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..arguments import Array
-from ..kernels.translations import forward_and_adjoint
+from ..kernels.translations import squares_and_gradients
 from ..translations import WIDTH_BOUND, Layers, directions_of, strengths_of
 from .lbfgs import minimize
 
@@ -33,7 +33,7 @@ def refine(layers: Layers, x: Array, y: Array, mu: float, *, weights: Array | No
 
     def unpack(flat: Array) -> tuple[Array, Array, Array, Array, Array]:
         centers, free = flat[: -shape[0]].reshape(2, *shape)
-        root = np.sqrt(1 + (free**2).sum(1, keepdims=True))
+        root = np.sqrt(1 + np.einsum("ij,ij->i", free, free))[:, None]
         widths = np.exp(flat[-shape[0] :]) / unit
         return centers * unit, free, root, widths, directions_of(free, widths, mu)
 
@@ -41,14 +41,13 @@ def refine(layers: Layers, x: Array, y: Array, mu: float, *, weights: Array | No
         centers, free, root, widths, directions = unpack(flat)
         squares = widths**2
         layers = np.column_stack([centers, directions, squares, squares * (directions**2).sum(1)])
-        moved, adjoint = forward_and_adjoint(layers, points)
-        missed = moved - targets
-        d_centers, d_directions, d_squares = np.split(adjoint(2 * share * missed), [shape[1], 2 * shape[1]], axis=1)
+        missed, gradients = squares_and_gradients(layers, points, targets, share)
+        d_centers, d_directions, d_squares = np.split(gradients, [shape[1], 2 * shape[1]], axis=1)
         d_bounded = mu * WIDTH_BOUND * d_directions / widths[:, None]
         d_free = d_bounded / root - free * ((d_bounded * free).sum(1, keepdims=True) / root**3)
         d_logs = 2 * squares * d_squares[:, 0] - (d_directions * directions).sum(1)
         gradient = np.concatenate([d_centers.ravel() * unit, d_free.ravel(), d_logs])
-        return scale * float((share * missed**2).sum()), scale * gradient
+        return scale * missed, scale * gradient
 
     bounds = layers.widths * np.linalg.norm(layers.directions, axis=1) / (mu * WIDTH_BOUND)
     shortened = layers.directions * np.minimum(1, np.sqrt(0.9999) / np.maximum(bounds, 1e-150))[:, None]

@@ -62,7 +62,9 @@ class Plan:
         good_score: ... and further ones until one scores less than this, or three times this after so many.
         deepen_above_score: where the best of so many scores more than this, and the depth is not given, more layers are
             the next to be tried.
-        first_steps, steps: of L-BFGS with what lies beside the path: for every candidate, and for those refined.
+        first_steps: of L-BFGS, with what lies beside the path, for every candidate of several demonstrations;
+            race_steps: for those refined of one; steps: for those refined of several, and those of one whose score is
+            then within the factor ``may_win`` of the best.
         follows_below: largest distance of the motion from the demonstrated start and the path that ends the search.
         note_above_miss: distance from the demonstration itself above which a fit that chooses its depth says so.
         hidden_above: noise or steps of a recording from which on a deeper search is of no use.
@@ -94,6 +96,8 @@ class Plan:
     good_score: float = 0.06
     deepen_above_score: float = 1.0
     first_steps: int = 60
+    race_steps: int = 50
+    may_win: float = 1.2
     steps: int = 300
     follows_below: float = 0.005
     note_above_miss: float = 0.01
@@ -278,8 +282,13 @@ class Search:
             deepen = self.n_layers is None and tried >= plan.least_refined and least > plan.deepen_above_score
             if tried and (enough or deepen) and not close:
                 break
-            better = candidate.widened(path, plan.steps) if several else candidate.refined(path)
+            better = candidate.widened(path, plan.steps) if several else candidate.refined(path, plan.race_steps)
             scored.append((self._score(better, path, law), better))
+        scored.sort(key=lambda pair: pair[0])
+        for score, candidate in scored[: plan.least_refined] if self.refined and not several else ():
+            if score < plan.may_win * scored[0][0]:
+                better = candidate.refined(path, plan.steps)
+                scored.append((self._score(better, path, law), better))
         scored.sort(key=lambda pair: pair[0])
         return [candidate for score, candidate in scored if score <= plan.close_score * scored[0][0]] or [scored[0][1]]
 
@@ -321,7 +330,8 @@ class Search:
         ahead = (left[0] - left) / step
         clocks = times + step * (ahead - ahead.round())[:, None]
         motions = shown.at(clocks)
-        misses = [dtw(path, motion) / plan.n_times / shown.size for path, motion in zip(paths, motions, strict=True)]
+        unit = plan.n_times * shown.size
+        misses = [dtw(path, motion) / unit for path, motion in zip(paths, motions, strict=True)]
         condition = float(ds.line_condition(plan.n_points).max())
         beside = plan.tube_weight * candidate.tube_error(path) if several else 0.0
         score = 3 * (misses[0] + missed) + float(np.mean(misses[1:])) + beside
@@ -352,6 +362,11 @@ class Search:
         return arc_length_path(self.shape.positions.numpy(), self.shape.times.numpy(), self.plan.dense_points)
 
     @cached_property
+    def _crowded(self) -> Array:
+        """The path again, denser where its strands are close."""
+        return crowded(self._fine[0], self.plan.crowded_points)
+
+    @cached_property
     def _even(self) -> Array:
         """Times at which a match is held against the motion."""
         return np.linspace(0, self._fine[2][-1], 8 * self.plan.n_times)
@@ -380,16 +395,16 @@ class Search:
     def _search_deeper(self, first: Candidate, path: Array, law: KnottedLaw) -> tuple[Candidate, tuple[str, ...]]:
         """The match that was found, or a deeper one, the first that follows the path; what stood in the way if none."""
         plan, shown = self.plan, self.shape
-        fine, even = self._fine[0], self._even
+        even = self._even
 
         def badness(candidate: Candidate) -> float:
             return self._off(self._trial(candidate, law))
 
         hidden = what_hides(shown.positions.numpy(), plan.hidden_above)
-        best, least, dense = first, badness(first), crowded(fine, plan.crowded_points)
+        best, least = first, badness(first)
         again: list[tuple[float, Candidate]] = []
         laid, stopped = 0, False
-        for layers, candidate in self._deeper(path, dense) if least > 1 and not hidden else ():
+        for layers, candidate in self._deeper(path) if least > 1 and not hidden else ():
             laid += layers
             if candidate is not None:
                 if self.several is not None and self.refined and len(candidate.line) == len(path):
@@ -400,7 +415,7 @@ class Search:
                 break
         else:
             for _, candidate in sorted(again, key=lambda pair: pair[0])[: 1 if self.refined else 0]:
-                better = candidate.refined(dense if len(candidate.line) == len(dense) else path, 100)
+                better = candidate.refined(path if len(candidate.line) == len(path) else self._crowded, 100)
                 again.append((badness(better), better))
         best, least = min([(least, best), *again], key=lambda pair: pair[0])[::-1]
         motion = self._trial(best, law).rollout(shown.start, torch.from_numpy(even)).numpy()
@@ -415,7 +430,7 @@ class Search:
             notes.append(f"misses the demonstration itself by {missed:.2g} of its size")
         return best, tuple(notes)
 
-    def _deeper(self, path: Array, dense: Array) -> Iterator[tuple[int, Candidate | None]]:
+    def _deeper(self, path: Array) -> Iterator[tuple[int, Candidate | None]]:
         """Layers laid and a match, if it ended in one, for a path that the first ones do not follow, quickest first.
 
         More layers; then homotopies tracked as closely as strands need, on points that are denser where they are close.
@@ -423,6 +438,7 @@ class Search:
         plan = self.plan
         for candidate in self._candidates(path, plan.deeper_layers):
             yield len(candidate.layers.widths), candidate
+        dense = self._crowded
         steps = step_lengths(dense)
         length, apart = float(steps.sum()), float(np.median(steps))
 
@@ -456,9 +472,13 @@ def refuse_crossings(path: Array, origin: Array, unit: float) -> None:
     count = len(step)
     first, second = np.triu_indices(count, max(2, count // 50))
     gap = start[first] - start[second]
-    near = segment_distances(gap, step[first], step[second])
-    worst = int(np.argmin(near))
-    if near[worst] < 1e-7 * extent(path):
+    touching = 1e-7 * extent(path)
+    lengths = np.linalg.norm(step, axis=1)
+    close = np.einsum("ij,ij->i", gap, gap) < (lengths[first] + lengths[second] + touching) ** 2
+    first, second = first[close], second[close]
+    near = segment_distances(gap[close], step[first], step[second])
+    if near.min(initial=math.inf) < touching:
+        worst = int(near.argmin())
         where = f"[{', '.join(f'{value:.4g}' for value in origin + unit * start[first[worst]])}]"
         raise ValueError(
             f"demonstration: expected a path that does not meet itself, got one that comes back to {where} "

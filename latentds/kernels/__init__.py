@@ -21,6 +21,7 @@ def warmup(dims: Sequence[int] = (2, 3)) -> None:
                 forward_kernel(dim, tangents, block)
         for tangents in (0, 1):
             forward_adjoint(dim, tangents)
+        forward_adjoint(dim, 0, True)
         inverse_adjoint(dim)
         for tangents in (0, dim):
             velocity_kernel(dim, tangents)

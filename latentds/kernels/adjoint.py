@@ -5,10 +5,11 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
+import numba
 import numpy as np
 
 from ..arguments import Array
-from .compiling import compiled
+from .compiling import OPTIONS, compiled
 from .lanes import WIDTH, anywhere, exp, load, store, where
 
 NEGLIGIBLE = 60.0
@@ -18,12 +19,24 @@ ROWS = 32
 """Points that go through the layers together: what the way there keeps of them for the way back fits the L2 cache."""
 
 
+@numba.njit(inline="always", **OPTIONS)  # type: ignore[untyped-decorator]
+def add_up(parts: Array, sums: Array) -> None:
+    """The sums whose eight parts each lie side by side, as a table."""
+    for j in range(len(sums)):
+        for e in range(sums.shape[1]):
+            at = (j * sums.shape[1] + e) * WIDTH
+            sums[j, e] = parts[at : at + WIDTH].sum()
+
+
 @cache
-def forward_adjoint(dim: int, tangents: int) -> Any:
+def forward_adjoint(dim: int, tangents: int, to_targets: bool = False) -> Any:
     """The kernel from dloss/dψ(x) and dloss/d(J_ψ t) to the gradients by points, tangents and layers.
 
     x and x_out are (m, n), gx (m, n) or (1, n); t is (m, n·T) or (1, n·T), gt and t_out (m, n·T). ``sums``
-    (M, 8·(2n+1)) receives each layer's gradient by c, v and ρ², in eight parts that the caller adds up.
+    (M, 2n+1) receives each layer's gradient by c, v and ρ².
+
+    The loss may be Σ w ‖ψ(x) - y‖² itself: then gx are the targets y (m, n), gt the weights w (m, 1), there are no
+    tangents, and x_out receives ψ(x).
     """
     entries = 2 * dim + 1
 
@@ -34,7 +47,7 @@ def forward_adjoint(dim: int, tangents: int) -> Any:
         row = (dim + 1 + tangents) * ROWS  # x before a layer; k; the tangents' growth
         kept = np.empty(count * row)
         near = np.empty((count, ROWS // WIDTH), np.bool_)
-        total = sums.reshape(sums.size)
+        total = np.zeros(len(layers) * entries * WIDTH)  # every sum in eight parts
         for begin in range(0, len(x), ROWS):
             size = min(ROWS, len(x) - begin)
             padded = (size + WIDTH - 1) // WIDTH * WIDTH
@@ -73,6 +86,12 @@ def forward_adjoint(dim: int, tangents: int) -> Any:
                         moved = load(held, d * ROWS + u, WIDTH)
                         store(kept, here + d * ROWS + u, moved)
                         store(held, d * ROWS + u, moved + k * layers[j, dim + d])
+            if to_targets:
+                for i in range(size):
+                    for d in range(dim):
+                        moved_to = held[d * ROWS + i]
+                        x_out[begin + i, d] = moved_to
+                        held[at_gx + d * ROWS + i] = 2.0 * gt[begin + i, 0] * (moved_to - held[at_gx + d * ROWS + i])
             for j in range(count - 1, -1, -1):
                 q, here, sum_at = layers[j, 2 * dim], j * row, j * entries * WIDTH
                 for u in range(0, padded, WIDTH):
@@ -120,10 +139,11 @@ def forward_adjoint(dim: int, tangents: int) -> Any:
                     place = sum_at + 2 * dim * WIDTH
                     store(total, place, load(total, place, WIDTH) + of_square)
             for i in range(size):
-                for d in range(dim):
+                for d in range(0 if to_targets else dim):
                     x_out[begin + i, d] = held[at_gx + d * ROWS + i]
                 for e in range(dim * tangents):
                     t_out[begin + i, e] = held[at_gt + e * ROWS + i]
+        add_up(total, sums)
 
     return compiled(sweep, f"void({', '.join(['float64[:, ::1]'] * 8)})")
 
@@ -139,7 +159,7 @@ def inverse_adjoint(dim: int) -> Any:
     def sweep(layers: Array, x: Array, gx: Array, y_out: Array, sums: Array) -> None:
         held = np.zeros(2 * dim * ROWS)
         at_g = dim * ROWS
-        total = sums.reshape(sums.size)
+        total = np.zeros(len(layers) * entries * WIDTH)  # every sum in eight parts
         for begin in range(0, len(x), ROWS):
             size = min(ROWS, len(x) - begin)
             padded = (size + WIDTH - 1) // WIDTH * WIDTH
@@ -180,5 +200,6 @@ def inverse_adjoint(dim: int) -> Any:
             for i in range(size):
                 for d in range(dim):
                     y_out[begin + i, d] = held[at_g + d * ROWS + i]
+        add_up(total, sums)
 
     return compiled(sweep, f"void({', '.join(['float64[:, ::1]'] * 5)})")

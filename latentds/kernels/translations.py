@@ -65,15 +65,12 @@ def _swept(layers: Array, points: Array, tangents: Array, n_tangents: int) -> tu
     return moved, pushed
 
 
-def forward_and_adjoint(layers: Array, points: Array) -> tuple[Array, Callable[[Array], Array]]:
-    """ψ of points (m, n), and the map from dloss/dψ to that of the layers' c, v and ρ²: (m, n) -> (M, 2n+1)."""
-    nothing = np.empty((len(points), 0))
-
-    def adjoint(of_moved: Array) -> Array:
-        kernel = forward_adjoint(points.shape[1], 0)
-        return _summed(kernel, layers, points, nothing, of_moved, nothing, np.empty_like(points), nothing)
-
-    return _swept(layers, points, np.empty((1, 0)), 0)[0], adjoint
+def squares_and_gradients(layers: Array, points: Array, targets: Array, weights: Array) -> tuple[float, Array]:
+    """Σ w ‖ψ(x) - y‖² of points x and targets y (m, n), weights (m, 1); and its gradients by c, v, ρ², (M, 2n+1)."""
+    moved, nothing = np.empty_like(points), np.empty((len(points), 0))
+    kernel = forward_adjoint(points.shape[1], 0, True)
+    gradients = _summed(kernel, layers, points, nothing, targets, weights, moved, nothing)
+    return float((weights * (moved - targets) ** 2).sum()), gradients
 
 
 Gradients = tuple[tuple[Tensor, ...], Array]
@@ -120,20 +117,20 @@ def _pulled_back(
 
 def _summed(kernel: Callable[..., None], layers: Array, points: Array, *by_row: Array) -> Array:
     """Run an adjoint kernel; what it adds up over the points for c, v and ρ² of every layer, (M, 2n+1)."""
-    shape = (len(layers), points.shape[1] * 2 + 1, WIDTH)
+    shape = (len(layers), points.shape[1] * 2 + 1)
     parts: list[tuple[int, Array]] = []
 
     def sweep(layers: Array, points: Array, *by_row: Array) -> None:
         count = len(points)
         for cut in range(0, count, BLOCK):
-            sums = np.zeros(shape)
+            sums = np.empty(shape)
             rows = (a[cut : cut + BLOCK] if len(a) == count else a for a in (points, *by_row))
-            kernel(layers, *rows, sums.reshape(len(sums), -1))
-            parts.append((points[cut:].ctypes.data, sums.sum(-1)))
+            kernel(layers, *rows, sums)
+            parts.append((points[cut:].ctypes.data, sums))
 
     run(lambda block: sweep, layers, points, *by_row)
     # Block by block in the order of the points, so that the sum is the same to the last bit on any number of cores.
-    total = np.zeros(shape[:2])
+    total = np.zeros(shape)
     for _, part in sorted(parts, key=lambda part: part[0]):
         total += part
     return total + (math.nan if np.isnan(points.sum()) else 0.0)  # as on the torch path

@@ -9,8 +9,7 @@ import numba
 import numpy as np
 
 from ..arguments import Array
-from ..tabulated import LawKind
-from ..time_law import LINEAR_BELOW
+from ..tabulated import LINEAR_BELOW, LawKind
 from .compiling import OPTIONS, compiled
 from .translations import BEYOND, first_root, next_root
 
