@@ -7,7 +7,7 @@ size N F is stored; the backward pass computes the cosines again, which is cheap
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numba
@@ -26,23 +26,20 @@ class Couplings:
     """Frozen features of couplings, laid out for the kernels.
 
     Args:
-        frequencies: per layer (2, F, a), as of the log-scale and of the shift.
-        phases: per layer (2, F).
+        frequencies, phases: as :class:`baselines.couplings.AffineCouplings` keeps them.
     """
 
-    def __init__(self, frequencies: Sequence[Tensor], phases: Sequence[Tensor]) -> None:
-        self.frequencies = torch.cat([part.mT.flatten() for part in frequencies]).numpy()
-        self.phases = torch.stack(list(phases)).numpy()
+    def __init__(self, frequencies: Tensor, phases: Tensor) -> None:
+        self.frequencies, self.phases = frequencies.numpy(), phases.numpy()
 
-    def linearize(self, u: Tensor, amplitudes: Sequence[Tensor]) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
+    def linearize(self, u: Tensor, amplitudes: Tensor) -> tuple[Tensor, Callable[[Tensor], Tensor]]:
         """φ(u), and the map of tangents (..., N, n) by the inverse of its Jacobian. Differentiable once.
 
         Args:
             u: (N, n).
-            amplitudes: per layer (2, b, F).
+            amplitudes: flat.
         """
-        joined = torch.cat([part.flatten() for part in amplitudes])
-        x, inverse_scale, slope = _Sweep.apply(u, joined, self)  # type: ignore[no-untyped-call]
+        x, inverse_scale, slope = _Sweep.apply(u, amplitudes, self)  # type: ignore[no-untyped-call]
 
         def push(tangent: Tensor) -> Tensor:
             stack = tangent.reshape(-1, *u.shape)

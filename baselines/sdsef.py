@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from latentds.arguments import refuse_tracing, whole_number
+from latentds.arguments import Array, refuse_tracing, whole_number
+from latentds.base import LatentDS
 from latentds.dynamics import Frame
+from latentds.kernels.dispatch import can_use_kernel, rows_of, run
+from latentds.kernels.functions import Operation, evaluate
+from latentds.kernels.private import is_altered
 
-from .couplings import AffineCouplings, no_autocast
+from .coupling_sweeps import LEAK, N_UNITS, CouplingTables, speed_kernel
+from .couplings import AffineCouplings, arrays_of, no_autocast
 from .flows import FlowDS, FlowDynamics, Normalized, descend_bending, quickest_linearize, ray_loss, unit_vector
 from .networks import linear, seeded_generator
 from .training import Plan, Training, descend
@@ -77,6 +84,18 @@ class SDSEF(FlowDS):
         self.seed = self_seed
         self.epochs = None if epochs is None else whole_number(epochs, "epochs", at_least=1)
 
+    def tables(self) -> CouplingTables | None:
+        own = type(self).forward is LatentDS.forward and type(self.dynamics) is NormalizedDescent
+        known = own and type(self.diffeomorphism) is AffineCouplings and not is_altered(self)
+        if not (known and self.diffeomorphism.fits() and self.dynamics.fits()):
+            return None
+        exact = copy.deepcopy(self).to("cpu", torch.float64)
+        frame, dynamics = exact.frame(), exact.dynamics
+        latent = np.append(frame.attractor.detach().numpy(), LINEAR_WITHIN * float(frame.length))
+        ends = np.append(dynamics.log_speed_range.numpy(), float(dynamics.duration))
+        arrays = arrays_of(exact.diffeomorphism.held())
+        return CouplingTables(*arrays, dynamics.weights.detach().numpy(), ends, latent)
+
     def _train(self, data: Normalized, generator: torch.Generator | None, progress: bool) -> Training:
         plan = PLANS[self.recipe]
         plan = plan if self.epochs is None else replace(plan, epochs=self.epochs)
@@ -87,19 +106,19 @@ class SDSEF(FlowDS):
 
     def _official_loss(self, data: Normalized) -> Callable[[Tensor], Tensor]:
         points, velocities, goal = (part.to(self.attractor) for part in (data.points, data.velocities, data.goal))
-        linearize, network = quickest_linearize(self.diffeomorphism), self.dynamics.network
+        linearize, log_speed = quickest_linearize(self.diffeomorphism), self.dynamics.log_speed
 
         def loss(batch: Tensor) -> Tensor:
             u = points[batch]
             x, push = linearize(torch.cat([u, goal.unsqueeze(0)]))
-            predicted = -network(u).exp() * push(unit_vector(x - x[-1]))[:-1]
+            predicted = -log_speed(u).exp().unsqueeze(-1) * push(unit_vector(x - x[-1]))[:-1]
             return nn.functional.smooth_l1_loss(predicted, velocities[batch])
 
         return loss
 
     def _tuned_loss(self, data: Normalized) -> Callable[[Tensor], Tensor]:
         def descent(u: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-            return unit_vector(z), -self.dynamics.network(u).exp()
+            return unit_vector(z), -self.dynamics.log_speed(u).exp().unsqueeze(-1)
 
         return ray_loss(self.diffeomorphism, descent, data)
 
@@ -116,6 +135,7 @@ class NormalizedDescent(FlowDynamics):
         generator: draws the network's weights (torch's global one if None).
 
     Attributes:
+        weights: parameter, of the network's three maps W (out, in) and b, flat.
         log_speed_range: (2,) buffer.
     """
 
@@ -125,15 +145,14 @@ class NormalizedDescent(FlowDynamics):
     def __init__(self, diffeomorphism: AffineCouplings, *, generator: torch.Generator | None = None) -> None:
         super().__init__()
         object.__setattr__(self, "psi", diffeomorphism)
-        sizes = [diffeomorphism.dim, 100, 100, 1]
-        maps = [linear(a, b, generator) for a, b in pairwise(sizes)]
-        self.network = nn.Sequential(maps[0], nn.LeakyReLU(), maps[1], nn.LeakyReLU(), maps[2])
+        maps = [linear(a, b, generator) for a, b in pairwise([diffeomorphism.dim, N_UNITS, N_UNITS, 1])]
+        self.weights = nn.Parameter(torch.cat([part.detach().flatten() for one in maps for part in one.parameters()]))
         self.register_buffer("log_speed_range", torch.tensor([-1.0, 1.0], dtype=torch.float64))
 
     @torch.no_grad()
     def settle(self, points: Tensor, duration: float) -> None:
         super().settle(points, duration)
-        log_speeds = self.network(points.to(self.duration))
+        log_speeds = self.log_speed(points.to(self.duration))
         self.log_speed_range.copy_(torch.stack([log_speeds.min() - 1, log_speeds.max() + 1]))
 
     def forward(self, x: Tensor, y: Tensor, frame: Frame) -> Tensor:
@@ -142,11 +161,24 @@ class NormalizedDescent(FlowDynamics):
         pull: Tensor = self.speed(y) / distance
         return -pull.unsqueeze(-1) * offset
 
+    def fits(self) -> bool:
+        """Whether the network is of the size that the constructor gave it: kernels would read beyond it."""
+        return self.weights.shape == (N_UNITS * (self.psi.dim + N_UNITS + 3) + 1,)
+
+    def log_speed(self, u: Tensor) -> Tensor:
+        """g, not yet held within its range, at normalised points: (..., n) -> (...)."""
+        return _log_speed(self.weights, u)
+
     def speed(self, y: Tensor) -> Tensor:
         """exp(g(y)), latent units per second: (..., n) -> (...)."""
-        with no_autocast(y):
-            log_speed: Tensor = self.network(self.psi.normalize(y)).squeeze(-1)
-        return log_speed.clamp(*self.log_speed_range).exp() / self.duration
+        psi = self.psi
+        parameters = self.weights, self.log_speed_range, self.duration, psi.center, psi.scale
+        named = can_use_kernel(("weights", "log_speed_range", "duration"), self, y)
+        if not (named and can_use_kernel(("center", "scale"), psi, y) and self.fits()):
+            return _speed(parameters, y)
+        weights, ends, duration, center, scale = (part.detach().numpy().astype(np.float64) for part in parameters)
+        packed = weights, np.append(ends, duration), np.stack([center, scale])
+        return evaluate(_SPEED, packed, parameters, y)
 
     def flow(self, x: Tensor, t: Tensor, frame: Frame) -> Tensor:
         """Every motion runs on the ray from x to x*, so only its timing is integrated.
@@ -198,6 +230,36 @@ class NormalizedDescent(FlowDynamics):
             rest[-1].append(f"log_speed_range: expected its lower end first, got {ends.tolist()}")
         else:
             super()._load_from_state_dict(state_dict, prefix, *rest)
+
+
+Parameters = Sequence[Tensor]
+"""Weights, range of the log-speed, duration; center and scale of the normalisation."""
+
+
+def _log_speed(weights: Tensor, u: Tensor) -> Tensor:
+    dim = u.shape[-1]
+    shapes = [(N_UNITS, dim), (N_UNITS,), (N_UNITS, N_UNITS), (N_UNITS,), (1, N_UNITS), (1,)]
+    parts = torch.split(weights, [math.prod(shape) for shape in shapes])
+    W1, b1, W2, b2, W3, b3 = (part.view(shape) for part, shape in zip(parts, shapes, strict=True))
+    with no_autocast(u):
+        hidden = nn.functional.leaky_relu(u @ W1.mT + b1, LEAK)
+        return (nn.functional.leaky_relu(hidden @ W2.mT + b2, LEAK) @ W3.mT + b3).squeeze(-1)
+
+
+def _speed(parameters: Parameters, y: Tensor) -> Tensor:
+    weights, ends, duration, center, scale = parameters
+    return _log_speed(weights, (y - center) / scale).clamp(*ends).exp() / duration
+
+
+def _speed_by_kernel(packed: tuple[Array, Array, Array], y: Tensor) -> Tensor:
+    weights, ends, box = packed
+    points = rows_of(y)
+    out = np.empty(len(points))
+    run(lambda block: lambda weights, *rows: speed_kernel()(box, weights, ends, *rows), weights, points, out)
+    return torch.from_numpy(out).to(y.dtype).reshape(y.shape[:-1])
+
+
+_SPEED = Operation(_speed_by_kernel, _speed)
 
 
 def _stretch(r: Tensor, guard: Tensor) -> Tensor:

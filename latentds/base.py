@@ -25,7 +25,8 @@ from torch import Tensor, nn
 from .arguments import check_points, check_precision, positive, real_tensor, whole_number
 from .demonstration import Demonstration, demonstrations_of
 from .deploy.controller import Controller
-from .deploy.tables import FieldTables, field_tables
+from .deploy.one_point import OnePoint
+from .deploy.tables import Compiled, FieldTables, field_tables
 from .diffeomorphism import Diffeomorphism, eager_for_derivatives
 from .dynamics import Frame, LatentDynamics
 from .fidelity import (
@@ -42,7 +43,7 @@ from .files import write_tensors
 from .findings import every_finding
 from .integrate import integrate
 from .kernels.dispatch import no_active_transforms
-from .kernels.private import is_altered, tensors_of
+from .kernels.private import is_altered, structure_of, tensors_of
 from .memo import Memo
 from .probes import restart_gap, round_trip_gap
 from .similarity import Similarity, check_rotation, turned_onto
@@ -365,7 +366,7 @@ class StableDS(nn.Module, ABC):
         0 is the attractor and the start lies at distance 1. None for a system without such a space."""
         return None
 
-    def tables(self) -> FieldTables | None:
+    def tables(self) -> Compiled | None:
         """The velocity field as plain arrays, for controllers and exporters; None where it cannot be written so."""
         return None
 
@@ -533,6 +534,7 @@ class LatentDS(StableDS):
         self.diffeomorphism = diffeomorphism
         self.dynamics = dynamics
         self._memo = Memo[Frame]()
+        self._one_point = OnePoint()
 
     def frame(self) -> Frame:
         """The latent attractor, axis and length, as ψ, ``attractor`` and ``start`` make them now."""
@@ -543,9 +545,10 @@ class LatentDS(StableDS):
         psi, attractor = self.diffeomorphism, self.attractor
         sources = [attractor, self.start, *tensors_of(psi)]
         differentiated = torch.is_grad_enabled() and any(source.requires_grad for source in sources)
-        if differentiated or attractor.is_meta or not no_active_transforms():
+        structure = structure_of(psi)
+        if differentiated or attractor.is_meta or structure is None or not no_active_transforms():
             return None
-        return self._memo.of((psi, attractor.dtype), sources, self._new_frame)
+        return self._memo.of([psi, attractor.dtype, *structure], sources, self._new_frame)
 
     def _new_frame(self) -> Frame:
         return Frame.between(*self.diffeomorphism.inverse(self._ends()).unbind())
@@ -636,7 +639,7 @@ class LatentDS(StableDS):
         error: Tensor = torch.linalg.vector_norm(self.encode(self.decode(x)) - x, dim=-1) / way
         return error
 
-    def tables(self) -> FieldTables | None:
+    def tables(self) -> Compiled | None:
         if type(self).forward is not LatentDS.forward or is_altered(self):
             return None  # a subclass whose velocity is another one must say itself how to write it
         exact = copy.deepcopy(self).to("cpu", torch.float64)
@@ -645,6 +648,8 @@ class LatentDS(StableDS):
     @eager_for_derivatives
     def forward(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
+        if (velocity := self._one_point.velocity(self, points)) is not None:
+            return velocity.to(wanted)
         x, push, frame = self._linearize(points)
         return push(self.dynamics(x, points, frame)).to(wanted)
 
@@ -735,7 +740,9 @@ class MovedDS(StableDS):
 
     def tables(self) -> FieldTables | None:
         inside = None if is_altered(self) else self.ds.tables()
-        return None if inside is None else self.similarity.tables(inside, self.ds.attractor, self.attractor)
+        if not isinstance(inside, FieldTables):
+            return None
+        return self.similarity.tables(inside, self.ds.attractor, self.attractor)
 
     def surroundings(self, ball: Tensor) -> Tensor | None:
         inside = self.ds.surroundings(ball)

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from .arguments import Array, positive
 from .kernels.dispatch import is_plain, no_active_transforms
+from .memo import Memo
 from .resizing import make_room
 from .tabulated import LINEAR_BELOW, LawKind, LawTable, Tabulated, rounded_pieces
 
@@ -125,6 +126,7 @@ class KnottedLaw(TimeLaw):
         _check_knots(knots, speeds)
         self.register_buffer("knots", knots)
         self.register_buffer("speeds", speeds)
+        self._memo = Memo[Tensor]()
 
     @classmethod
     def uniform(cls, duration: float = 1.0) -> KnottedLaw:
@@ -249,7 +251,10 @@ class KnottedLaw(TimeLaw):
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     def _pieces(self) -> Tensor:
-        return rounded_pieces(self.knots, self.speeds)
+        knots, speeds = self.knots, self.speeds
+        if (torch.is_grad_enabled() and (knots.requires_grad or speeds.requires_grad)) or not no_active_transforms():
+            return rounded_pieces(knots, speeds)
+        return self._memo.of(None, [knots, speeds], lambda: rounded_pieces(knots, speeds))
 
 
 def _check_knots(knots: Tensor, speeds: Tensor) -> None:
@@ -268,7 +273,7 @@ def _piece_of(values: Tensor, edges: Tensor) -> Tensor:
     torch wakes a thread a core for more than 200 values, which then spin for longer than it takes to find them all.
     """
     values = values.detach()
-    if values.numel() > 200 and is_plain(values, values.dtype) and no_active_transforms():
+    if no_active_transforms() and is_plain(values, values.dtype) and values.numel() > 200:
         found = np.searchsorted(edges.detach().numpy(), values.numpy().ravel())
         return torch.from_numpy(found).view(values.shape)
     return torch.bucketize(values, edges)

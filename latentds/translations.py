@@ -200,7 +200,7 @@ class LocallyWeightedTranslations(Diffeomorphism):
             (y,) = _translate(*layer, y)
         return tuple(y.tolist())
 
-    def _stacked(self) -> TorchLayers:
+    def _stacked(self) -> tuple[Tensor, Tensor, Tensor]:
         """(c, v, ρ²) of all layers."""
         return self.centers, self.directions, torch.exp(2 * self.log_widths).unsqueeze(-1)
 
@@ -370,7 +370,7 @@ def _everywhere(done: Tensor) -> bool:
         return False
 
 
-_FORWARD = Operation(translations.forward, translations.forward_gradients, _forward, _layers_of)
-_INVERSE = Operation(translations.inverse, translations.inverse_gradients, _inverse, _layers_of)
-_JACOBIAN = Operation(translations.jacobian, translations.jacobian_gradients, _jacobian, _layers_of)
-_PUSH = Operation(translations.push, translations.push_gradients, _pushed, _layers_of)
+_FORWARD = Operation(translations.forward, _forward, _layers_of, translations.forward_gradients)
+_INVERSE = Operation(translations.inverse, _inverse, _layers_of, translations.inverse_gradients)
+_JACOBIAN = Operation(translations.jacobian, _jacobian, _layers_of, translations.jacobian_gradients)
+_PUSH = Operation(translations.push, _pushed, _layers_of, translations.push_gradients)

@@ -15,6 +15,7 @@ from baselines import FDM, SDSEF
 from latentds import ChebyshevDS, TubeDS, datasets
 from latentds.kernels.dispatch import reference
 from latentds.testing import wavy_motion
+from latentds.time_law import KnottedLaw
 
 
 @pytest.fixture
@@ -259,3 +260,78 @@ def test_demonstrations_of_other_columns_are_not_fitted_together():
     swapped = replace(NAMED, columns=("elbow", "shoulder"))
     with pytest.raises(ValueError, match=r"^demonstration: expected the same columns in all, got"):
         TubeDS(2).fit([NAMED, swapped])
+
+
+def write_through_data(ds):
+    next(ds.parameters()).data[0] += 0.05  # no version counter moves
+
+
+def slow_the_law(ds):
+    ds.dynamics.law.speeds.mul_(0.5)
+
+
+def replace_the_law(ds):
+    ds.dynamics.law = KnottedLaw.uniform(7.0)
+
+
+def hook(ds):
+    ds.dynamics.register_forward_hook(lambda module, given, result: 2 * result)
+
+
+def set_a_method(ds):
+    ds.dynamics.forward = lambda x, y, frame: torch.ones_like(x)
+
+
+def move_the_attractor(ds):
+    ds.attractor += 0.1
+
+
+def parametrize(ds):
+    torch.nn.utils.parametrize.register_parametrization(ds.diffeomorphism, "strengths", Halved())
+
+
+def not_a_number(ds):
+    next(ds.parameters()).data[0] = torch.nan
+
+
+class Halved(torch.nn.Module):
+    def forward(self, strengths):
+        return strengths / 2
+
+
+CHANGES = [write_through_data, slow_the_law, replace_the_law, hook, set_a_method, move_the_attractor, parametrize]
+
+
+@pytest.mark.parametrize("change", [*CHANGES, not_a_number])
+def test_the_velocity_of_one_point_sees_every_change(change):
+    shown = wavy_motion(2)
+    ds = TubeDS(2, n_layers=20).fit(shown).requires_grad_(False)
+    y = shown.start + 0.05
+    before = ds(y)
+    with reference():
+        torch.testing.assert_close(before, ds(y), rtol=1e-9, atol=1e-12)
+    change(ds)
+    after = ds(y)
+    with reference():
+        torch.testing.assert_close(after, ds(y), rtol=1e-9, atol=1e-12, equal_nan=True)
+    assert not torch.equal(before, after)
+
+
+def test_the_velocity_of_one_point_has_every_shape_dtype_and_derivative():
+    shown = wavy_motion(3)
+    ds = TubeDS(3, n_layers=20).fit(shown)
+    y = shown.start + 0.05
+    assert ds(y).requires_grad
+    with torch.no_grad():
+        for shape in [(3,), (1, 3), (1, 1, 3)]:
+            assert ds(y.view(shape)).shape == shape
+        assert ds(y.float()).dtype == torch.float32
+        assert ds(torch.full((3,), torch.nan)).isnan().all()
+        assert torch.equal(copy.deepcopy(ds)(y), ds(y))
+        wanted = ds(y)
+        torch.testing.assert_close(torch.func.vmap(ds)(y[None])[0], wanted)
+        torch.testing.assert_close(ds.float()(y), wanted, rtol=1e-4, atol=1e-5)
+    frozen = pickle.loads(pickle.dumps(ds)).double().requires_grad_(False)
+    point = y.clone().requires_grad_()
+    frozen(point).sum().backward()
+    assert point.grad is not None

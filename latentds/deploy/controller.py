@@ -11,11 +11,7 @@ import numpy as np
 import torch
 
 from ..arguments import Array, number_in, positive, real_array
-from ..kernels.velocity import velocity_kernel
-from .tables import VelocityField
-
-NO_SLOPES: Array = np.empty((1, 0))
-"""Where the kernel puts derivatives when none are asked."""
+from .tables import NO_SLOPES, VelocityField
 
 
 class Controller:
@@ -23,8 +19,8 @@ class Controller:
 
     It keeps its own copy: fitting or moving the system afterwards does not change it. Any number of threads may call
     it at once. Systems of locally weighted translations with the dynamics of this package run in one compiled call
-    without torch, and allocate nothing when ``out`` is given; any other system is asked through torch, correct but
-    slower by torch's overhead (see ``compiled``).
+    without torch, and so does SDS-EF; they allocate nothing when ``out`` is given. Any other system is asked through
+    torch, correct but slower by torch's overhead (see ``compiled``).
 
     Where the motion ends and how fast it runs can be set while it runs. Both may jump then, and with them the velocity;
     :meth:`approach`, once a cycle, lets them follow smoothly.
@@ -48,9 +44,10 @@ class Controller:
             raise ValueError(f"ds: expected finite parameters, got {type(ds).__name__} with NaN or inf")
         self._attractor = ds.attractor.detach().to("cpu", torch.float64, copy=True).numpy()
         self._placed = np.array([*np.zeros(self.dim), 1.0, self.max_speed])  # shift, speed, limit: as the kernel has it
-        tables = ds.tables()
-        self._tables = None if tables is None else tables.packed()
-        self._ds = copy.deepcopy(ds).requires_grad_(False) if self._tables is None else None
+        self._field = ds.tables()
+        self._tables = None if self._field is None else self._field.packed()
+        by_torch = self._field is None or self._field.kernel(self.dim) is None
+        self._ds = copy.deepcopy(ds).requires_grad_(False) if by_torch else None
         self._prepare()
         self(np.zeros(self.dim))
 
@@ -113,7 +110,7 @@ class Controller:
             raise ValueError(
                 f"out: expected a writeable C-contiguous float64 array {y.shape}, got {out.dtype} {out.shape}"
             )
-        if self._tables is None:
+        if self._tables is None or self._kernel is None:
             with torch.no_grad():
                 out[...] = self._ask(torch.from_numpy(_finite(y))).numpy()
             return out
@@ -137,7 +134,8 @@ class Controller:
             (..., n, n) float64, per second: [..., i, j] is the derivative of velocity i by coordinate j.
         """
         y = self._points(y)
-        if self._tables is None:
+        kernel = None if self._field is None else self._field.kernel(self.dim)
+        if kernel is None:
             points = torch.from_numpy(_finite(y)).clone().requires_grad_()
             with torch.enable_grad():
                 velocity = self._ask(points)
@@ -145,7 +143,7 @@ class Controller:
             return torch.stack(rows, -2).numpy()
         count, out = y.size // self.dim, np.empty((*y.shape, self.dim))
         own, slopes = y.reshape(count, self.dim), out.reshape(count, self.dim**2)
-        kernel = velocity_kernel(self.dim, self.dim)
+        assert self._tables is not None
         if not kernel(*self._tables, own, np.empty_like(own), slopes, self._room()):
             _finite(y)
         return out
@@ -160,8 +158,7 @@ class Controller:
     def _prepare(self) -> None:
         """What neither copies nor pickles hold."""
         self._local = threading.local()
-        if self._tables is not None:
-            self._kernel = velocity_kernel(self.dim, 0)
+        self._kernel = None if self._field is None else self._field.kernel(0)
 
     def _points(self, y: Any) -> Array:
         points = _real(y)
@@ -192,8 +189,8 @@ class Controller:
         try:
             room: Array = self._local.room
         except AttributeError:
-            assert self._tables is not None
-            self._local.room = room = np.empty((len(self._tables[0]) + 2 + self.dim, self.dim + 2))
+            assert self._field is not None
+            self._local.room = room = self._field.room()
         room[-1] = self._placed
         return room
 

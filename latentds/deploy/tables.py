@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import re
+from collections.abc import Callable
 from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -12,9 +13,30 @@ from torch import Tensor
 from ..arguments import Array
 from ..diffeomorphism import Diffeomorphism
 from ..dynamics import Frame, LatentDynamics
+from ..kernels.velocity import velocity_kernel
 from ..tabulated import LawTable
 
 Self = TypeVar("Self", bound="VelocityField")
+
+Kernel = Callable[..., bool]
+"""(*arrays, points (m, n), velocities (m, n), slopes, room) -> whether all points were finite."""
+
+
+NO_SLOPES: Array = np.empty((1, 0))
+"""Where the kernel puts derivatives when none are asked."""
+
+
+class Compiled(Protocol):
+    """A velocity field as numbers that a compiled function reads."""
+
+    def packed(self) -> tuple[Array, ...]:
+        """The arrays that the function takes first."""
+
+    def kernel(self, tangents: int) -> Kernel | None:
+        """The function, which also gives derivatives by so many coordinates; None if it cannot."""
+
+    def room(self) -> Array:
+        """What the function works in; its last row is for the shift (n), the speed and the limit."""
 
 
 class FieldTables(NamedTuple):
@@ -30,8 +52,15 @@ class FieldTables(NamedTuple):
     """the time law across it"""
 
     def packed(self) -> tuple[Array, Array, Array, Array]:
-        """As the velocity kernel takes them."""
         return self.layers, self.goal, self.along.packed(), self.across.packed()
+
+    def kernel(self, tangents: int) -> Kernel:
+        function: Kernel = velocity_kernel(self.goal.shape[1], tangents)
+        return function
+
+    def room(self) -> Array:
+        dim = self.goal.shape[1]
+        return np.empty((len(self.layers) + 2 + dim, dim + 2))
 
 
 class VelocityField(Protocol):
@@ -40,7 +69,7 @@ class VelocityField(Protocol):
     dim: int
     attractor: Tensor
 
-    def tables(self) -> FieldTables | None: ...
+    def tables(self) -> Compiled | None: ...
 
     def state_dict(self) -> dict[str, Tensor]: ...
 
@@ -56,7 +85,7 @@ def tables_of(ds: VelocityField) -> FieldTables:
         ValueError: if it has none, naming what cannot be written so, or if a number in them is not finite.
     """
     tables = ds.tables()
-    if tables is None:
+    if not isinstance(tables, FieldTables):
         psi, dynamics, frame = (getattr(ds, name, None) for name in ("diffeomorphism", "dynamics", "frame"))
         if isinstance(psi, Diffeomorphism) and psi.table() is None:
             missing = f"its diffeomorphism {type(psi).__name__} has no table()"

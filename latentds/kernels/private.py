@@ -48,8 +48,8 @@ def is_batch_of_gradients(tensor: Tensor) -> bool:
 
 
 def held_parameters(module: nn.Module, names: Sequence[str]) -> list[Tensor | None]:
-    """The parameters of these names; None for one that torch.nn.utils.parametrize computes, which getattr would do."""
-    return [module._parameters.get(name) for name in names]
+    """Parameters or buffers of these names; None for one that torch.nn.utils.parametrize computes, as getattr would."""
+    return [module._parameters.get(name, module._buffers.get(name)) for name in names]
 
 
 def tensors_of(module: nn.Module) -> list[Tensor]:
@@ -60,11 +60,26 @@ def tensors_of(module: nn.Module) -> list[Tensor]:
 
 def is_altered(module: nn.Module) -> bool:
     """Whether hooks, or methods set on instances, make a module or one in it compute something else than its class."""
+    return structure_of(module) is None
+
+
+def structure_of(module: nn.Module) -> list[object] | None:
+    """The classes of a module and of those in it, with what they keep beside tensors; None if it :func:`is_altered`.
+
+    Equal as long as no attribute is another one.
+    """
+    found: list[object] = []
     for part in module.modules():
-        hooks = (part._forward_hooks, part._forward_pre_hooks, part._backward_hooks, part._backward_pre_hooks)
-        if any(hooks) or any(callable(getattr(type(part), name, None)) for name in vars(part)):
-            return True
-    return False
+        own = type(part)
+        if part._forward_hooks or part._forward_pre_hooks or part._backward_hooks or part._backward_pre_hooks:
+            return None
+        found.append(own)
+        for name, value in part.__dict__.items():
+            if name[0] != "_":
+                if callable(value) and callable(getattr(own, name, None)):
+                    return None
+                found.append(value)
+    return found
 
 
 def graph_loops() -> tuple[Any, Any]:

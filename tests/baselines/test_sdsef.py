@@ -15,6 +15,7 @@ import baselines.flows
 from baselines import SDSEF
 from baselines.training import MAX_RECOVERIES, Plan, descend
 from latentds import Demonstration, datasets
+from latentds.kernels.dispatch import reference
 from latentds.testing import wavy_motion
 
 
@@ -49,7 +50,7 @@ def test_gradients_of_a_rollout_are_right(fitted):
     ds = copy.deepcopy(fitted)
     start = wavy_motion(3).start
     times = torch.tensor([0.0, 0.4, 1.1], dtype=torch.float64)
-    bias = ds.dynamics.network[-1].bias
+    weights = ds.dynamics.weights
     rows = start.expand(2, 3).clone().requires_grad_()
     ds.rollout(rows, times)[:, -1, 0].sum().backward()
     assert all(p.grad is not None and bool((p.grad != 0).any()) for p in ds.parameters())
@@ -60,10 +61,10 @@ def test_gradients_of_a_rollout_are_right(fitted):
             assert float(rows.grad[0, j]) == pytest.approx(float(ahead - behind) / (2 * step), rel=1e-3, abs=1e-5)
         found = []
         for sign in (1, -1):
-            bias += sign * step
+            weights[-1] += sign * step  # the last bias
             found.append(float(ds.rollout(start, times)[-1, 0]))
-            bias -= sign * step
-    assert float(bias.grad) == pytest.approx(2 * (found[0] - found[1]) / (2 * step), rel=1e-3)
+            weights[-1] -= sign * step
+    assert float(weights.grad[-1]) == pytest.approx(2 * (found[0] - found[1]) / (2 * step), rel=1e-3)
 
 
 def test_speed_is_in_units_per_second_and_the_goal_exact(fitted):
@@ -259,3 +260,37 @@ class TestDescend:
         descend(loss, [point], 2, Plan(epochs=20, learning_rate=0.1), progress="parabola")
         out, err = capfd.readouterr()
         assert "parabola" in out + err
+
+
+def test_one_compiled_call_gives_the_velocity(fitted):
+    y = wavy_motion(3).positions[::7] + 0.05
+    controller = fitted.controller()
+    assert controller.compiled
+    with torch.no_grad():
+        wanted = fitted(y)
+        one_by_one = torch.stack([fitted(row) for row in y])
+        with reference():
+            by_torch = fitted(y)
+    torch.testing.assert_close(wanted, by_torch, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(one_by_one, wanted, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(controller(y.numpy()), wanted, rtol=1e-10, atol=1e-12)
+    slopes = torch.func.vmap(torch.func.jacrev(fitted))(y).detach()
+    np.testing.assert_allclose(controller.jacobian(y.numpy()), slopes, rtol=1e-8, atol=1e-8)
+    limited = fitted.controller(max_speed=0.1)(y.numpy())
+    assert np.linalg.norm(limited, axis=1).max() <= 0.1 * (1 + 1e-12)
+    controller.goal = fitted.attractor.numpy() + 0.2
+    np.testing.assert_allclose(controller(y.numpy() + 0.2), wanted, rtol=1e-9, atol=1e-12)
+
+
+def test_the_compiled_call_sees_every_change(fitted):
+    ds, y = copy.deepcopy(fitted).requires_grad_(False), wavy_motion(3).start + 0.1
+    before = ds(y)
+    ds.dynamics.weights.data[-1] += 0.1  # no version counter moves
+    after = ds(y)
+    assert not torch.equal(before, after)
+    with reference():
+        torch.testing.assert_close(after, ds(y))
+    ds.dynamics.duration *= 2
+    torch.testing.assert_close(ds(y), after / 2)
+    ds.dynamics.register_forward_hook(lambda module, given, result: 3 * result)
+    torch.testing.assert_close(ds(y), 3 * after / 2)

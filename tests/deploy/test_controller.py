@@ -44,9 +44,9 @@ COMPILED = {
     "Chebyshev": lambda dim: ChebyshevDS(dim, n_layers=30),
     "FDM": lambda dim: FDM(dim, n_layers=30),
     "Tube": Tube,
+    "SDSEF": lambda dim: SDSEF(dim, n_layers=2, n_features=10, seed=0),
 }
 OTHER = {
-    "SDSEF": lambda dim: SDSEF(dim, n_layers=2, n_features=10, seed=0),
     "Scaled": lambda dim: Scaled(dim, n_layers=30),
 }
 
@@ -203,7 +203,7 @@ def test_jacobian_is_that_of_the_system(make, dim):
     assert controller.jacobian(points[:0]).shape == (0, dim, dim)
 
 
-@pytest.mark.parametrize("make", [COMPILED["Chebyshev"], COMPILED["Tube"], OTHER["SDSEF"]])
+@pytest.mark.parametrize("make", [COMPILED["Chebyshev"], COMPILED["Tube"], COMPILED["SDSEF"], OTHER["Scaled"]])
 def test_jacobian_of_what_is_returned(make):
     """With another goal, another speed and a limit that half of the points exceed."""
     ds, shown = fitted(make, 3)
@@ -243,7 +243,7 @@ def test_the_jacobian_leaves_its_argument_and_refuses_what_a_call_does():
 
 # --- goals, speeds and limits -----------------------------------------------------------------------------------------
 
-BOTH = [COMPILED["Tube"], OTHER["SDSEF"]]
+BOTH = [COMPILED["Tube"], COMPILED["SDSEF"], OTHER["Scaled"]]
 
 
 @pytest.mark.parametrize("make", BOTH)
