@@ -127,21 +127,25 @@ def imports(rounds: int) -> Goal:
     )
 
 
-def fresh(rounds: int) -> Goal:
-    """A first fit where nothing was compiled before."""
-    seconds, warming = np.array([[fresh_child(call) for call in FIRST] for _ in range(rounds)]).T
-    note = f"warmup([3]): {np.median(warming):.1f} s"
+def first_call(what: str) -> list[float]:
+    """CPU seconds of the first fit or warm-up of this process."""
+    calls = {"fit": partial(TubeDS(3).fit, SHOWN), "warmup": partial(kernels.warmup, [3])}
+    return [timed(calls[what], time.process_time)]
+
+
+def fresh(what: str, rounds: int) -> Array:
+    """CPU seconds of it where Numba's cache is empty, (rounds,)."""
+    seconds = []
+    for _ in range(rounds):
+        with TemporaryDirectory() as folder:
+            seconds += [*of_child(f"first_call({what!r})", {**ONE_THREAD, "NUMBA_CACHE_DIR": folder})]
+    return np.array(seconds)
+
+
+def first_fit(rounds: int) -> Goal:
+    note = f"warmup([3]), which compiles more than a fit needs: {fresh('warmup', 1)[0]:.1f} s"
+    seconds = fresh("fit", rounds)
     return report.median("first fit on a fresh machine", "s of CPU time", 6, seconds, at_most=True, note=note)
-
-
-FIRST = ("TubeDS(3).fit(SHOWN)", "kernels.warmup([3])")
-
-
-def fresh_child(call: str) -> float:
-    """CPU seconds of a call where Numba's cache is empty."""
-    with TemporaryDirectory() as folder:
-        environment = {**ONE_THREAD, "NUMBA_CACHE_DIR": folder}
-        return float(of_child(f"[timed(lambda: scale.{call}, scale.time.process_time)]", environment)[0])
 
 
 # --- much of everything -----------------------------------------------------------------------------------------------
@@ -249,16 +253,16 @@ def stored(cells: int, rounds: int) -> list[Goal]:
 
 
 def measure(quick: bool) -> list[Goal]:
-    """All of it; ``quick``: a tenth or less of the work."""
+    """All of it; ``quick``: a tenth or less of the work, without what takes as long for little: compiling and Dask."""
     few, tenth = (2, 10) if quick else (5, 1)
     return [
         *threads(few // 2),
         imports(few),
-        fresh(few // 2),
+        *([] if quick else [first_fit(few // 2)]),
         *points(10**7 // tenth, 5 * few),
         large_fits(1000, 10) if quick else large_fits(10**5, 30),
         many_fits("joblib, all cores", 1000 // tenth, joblib.cpu_count()),
-        *on_dask(1000 // tenth),
+        *([] if quick else on_dask(1000)),
         *stored(10**4 // tenth, 5 * few),
     ]
 
