@@ -2,6 +2,9 @@
 
     python -m experiments.speed [--quick] [--out results/speed]
 
+Then what needs processes and cores of its own: :mod:`experiments.scale` and, but for ``--quick``,
+:mod:`experiments.deployed`.
+
 Rivals take turns, and what counts are ratios of medians, in CPU time of the one thread that computes: other processes
 then slow both through shared caches only, where in wall time they would interrupt the longer call more often than the
 shorter one. A control loop's latency is wall time, interruptions included, so run this on an otherwise idle machine.
@@ -10,6 +13,7 @@ Leaves goals.csv, growth.csv, summary.md, growth.png and environment.json in ``-
 
 from __future__ import annotations
 
+import importlib
 import math
 import os
 import time
@@ -31,9 +35,10 @@ from scipy.optimize import minimize_scalar
 from torch import Tensor, nn
 
 from baselines import SDSEF
-from experiments import deployed, report
+from experiments import deployed, report, scale
 from experiments.report import Goal, at_most
-from latentds import ChebyshevDS, TubeDS, datasets, kernels
+from experiments.scale import SHOWN, take_turns
+from latentds import ChebyshevDS, LatentDS, TubeDS, datasets, kernels
 from latentds.arguments import Array
 from latentds.fitting.matching import match
 from latentds.kernels.compiling import OPTIONS
@@ -42,7 +47,6 @@ from latentds.kernels.lanes import WIDTH, exp, load, store
 from latentds.translations import WIDTH_BOUND
 
 N_LAYERS = 150
-SHOWN = datasets.unstable_spiral(7)
 
 # --- the floor --------------------------------------------------------------------------------------------------------
 
@@ -66,6 +70,9 @@ def products(buffer: Array, repeats: int) -> None:
         g, h, i, j, k, n = g * m + m, h * m + m, i * m + m, j * m + m, k * m + m, n * m + m
     store(buffer, 0, a + b + c + d + e + f + g + h + i + j + k + n)
 
+
+BUFFER, REPEATS = np.full(BLOCK, 0.5), 20_000
+"""What the two run over; of the first, ``REPEATS * BLOCK`` exponentials."""
 
 OPERATIONS = 3 + 3 + 1 + 3
 """Vector operations of a layer at n = 3 beside its exponential: x - c, the squared length, times ρ², and x + k v."""
@@ -146,24 +153,6 @@ def match_loop(x: Array, y: Array, n_layers: int, beta: float, mu: float) -> flo
 # --- timing -----------------------------------------------------------------------------------------------------------
 
 
-def take_turns(rivals: Mapping[str, Callable[[], Any]], rounds: int, share: float = 0.02) -> dict[str, Array]:
-    """CPU seconds a call, (rounds,) each: in each round, each rival runs for about ``share`` s, once at least."""
-    counts = {}
-    for name, call in rivals.items():
-        call()
-        began = time.thread_time()
-        call()
-        counts[name] = max(1, int(share / max(time.thread_time() - began, 1e-7)))
-    seconds: dict[str, list[float]] = {name: [] for name in rivals}
-    for _ in range(rounds):
-        for name, call in rivals.items():
-            began = time.thread_time()
-            for _ in range(counts[name]):
-                call()
-            seconds[name].append((time.thread_time() - began) / counts[name])
-    return {name: np.array(values) for name, values in seconds.items()}
-
-
 def race(what: str, least: float, slow: Callable[[], Any], fast: Callable[[], Any], rounds: int) -> Goal:
     """That ``fast`` is ``least`` times faster than ``slow``."""
     times = take_turns({"slow": slow, "fast": fast}, rounds)
@@ -182,11 +171,10 @@ def latent_points(ds: ChebyshevDS, count: int, seed: int = 0) -> Tensor:
 
 def against_floor(ds: ChebyshevDS, rounds: int) -> list[Goal]:
     layers, x = layers_of(ds), latent_points(ds, 100_000)
-    buffer, repeats = np.full(BLOCK, 0.5), 20_000
-    floors = {"exponentials": partial(exponentials, buffer, repeats), "products": partial(products, buffer, repeats)}
+    floors = {"exponentials": partial(exponentials, BUFFER, REPEATS), "products": partial(products, BUFFER, REPEATS)}
     times = take_turns({"decode": partial(ds.decode, x), **floors}, rounds)
-    each_exp = times["exponentials"] / repeats / BLOCK
-    each_product = times["products"] / repeats / 12 / WIDTH
+    each_exp = times["exponentials"] / REPEATS / BLOCK
+    each_product = times["products"] / REPEATS / 12 / WIDTH
     floor = (each_exp + OPERATIONS * each_product) * N_LAYERS * len(x)
     note = (
         f"floor {np.median(floor) / N_LAYERS / len(x) * 1e9:.2f} ns a layer and point: exponential "
@@ -337,6 +325,66 @@ def sdsef_step(rounds: int) -> list[Goal]:
         return [race(what, 6, partial(step, inverted), partial(step, back_sweep), rounds)]
 
 
+BEFORE = {
+    "TubeDS(3) fit, unstable c = 3": 6.28e9,
+    "TubeDS(3) fit, unstable c = 7": 6.96e9,
+    "TubeDS(3) fit, stable c = 5": 7.15e9,
+    "SDS-EF, velocity of one point": 3.23e6,
+    "SDS-EF, rollout 1 x 200": 5.54e7,
+    "SDS-EF, rollout 16 x 200": 2.57e9,
+}
+"""What calls took at revision 5f85714, in exponentials of the floor: medians of five processes of that revision that
+took turns with five of c524d5e, one thread, CPU time, on 28 November 2026 (Xeon with AVX-512, 0.40 ns an exponential).
+
+That revision is not at hand where this runs; an exponential is a yardstick that goes along. It is a rough one, by a
+third or so: torch's own operations and the memory need not grow with the width of the registers.
+"""
+
+
+def against_before(rounds: int) -> list[Goal]:
+    """Today's calls against those of revision 5f85714, and SDS-EF's velocity against the clock."""
+    flow = SDSEF(3, seed=0, epochs=2).fit(SHOWN)
+    start, times = SHOWN.start, torch.linspace(0, SHOWN.duration, 200, dtype=torch.float64)
+    spirals = (datasets.unstable_spiral(3), SHOWN, datasets.stable_spiral(5))
+    calls: list[tuple[float, Callable[[], Any]]] = [
+        *((3, partial(TubeDS(3).fit, shown)) for shown in spirals),
+        (5, partial(flow, SHOWN.positions[400])),
+        (5, partial(flow.rollout, start, times)),
+        (5, partial(flow.rollout, start.expand(16, 3), times)),
+    ]
+    goals = [one_point("SDS-EF, L = 10, F = 200, ds(y) of one point", flow, rounds)]
+    for (what, before), (least, call) in zip(BEFORE.items(), calls, strict=True):
+        clock = take_turns({"now": call, "exponentials": partial(exponentials, BUFFER, REPEATS)}, max(1, rounds // 8))
+        then = before * clock["exponentials"] / REPEATS / BLOCK
+        goals.append(report.ratio(f"{what}, 5f85714 as recorded", least, then, clock["now"]))
+    return goals
+
+
+def one_point(what: str, ds: LatentDS, rounds: int) -> Goal:
+    times = take_turns({"ds(y)": partial(ds, SHOWN.positions[400])}, rounds)
+    return report.median(what, "µs", 60, 1e6 * times["ds(y)"], at_most=True)
+
+
+def rivals(ds: ChebyshevDS, rounds: int) -> list[Goal]:
+    """torch.func for the Jacobian of a decoded point, and a public library's coupling flow of as many layers."""
+    psi, x = ds.diffeomorphism, latent_points(ds, 1000)
+    goals = []
+    for derivative in (torch.func.jacrev, torch.func.jacfwd):
+        slow = partial(torch.func.vmap(derivative(ds.decode)), x)
+        torch.testing.assert_close(psi.jacobian(x), slow())
+        what = f"Jacobian of decode at 1000 points, torch.func.{derivative.__name__}"
+        goals.append(race(what, 1, slow, partial(psi.jacobian, x), max(3, rounds // 4)))
+    try:
+        flows = importlib.import_module("zuko.flows")
+    except ImportError:
+        print("Coupling flows of zuko are not compared: pip install zuko.")
+        return goals
+    theirs = flows.RealNVP(3, transforms=10, hidden_features=(200,)).double()().transform
+    ours = SDSEF(3, n_layers=10, n_features=200, seed=0).diffeomorphism
+    what = "10 couplings of 200 features at 1000 points, RealNVP of zuko"
+    return [*goals, race(what, 1, partial(theirs, x), partial(ours, x), rounds)]
+
+
 def growth(quick: bool) -> pd.DataFrame:
     """Seconds of each call as N or M grows."""
     rows = []
@@ -387,10 +435,10 @@ def draw_growth(curves: pd.DataFrame) -> Figure:
 
 
 def main(
-    quick: Annotated[bool, typer.Option(help="Fewer rounds, no million points, one export: some two minutes.")] = False,
+    quick: Annotated[bool, typer.Option(help="Fewer rounds, a tenth of the sizes, no export: a minute.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for tables, curves and the picture.")] = Path("results/speed"),
 ) -> None:
-    """Measure every public call against a torch loop and a measured floor, on one core."""
+    """Measure every public call against a torch loop and a measured floor, on one core; then what needs more."""
     torch.set_num_threads(1)
     torch.set_grad_enabled(False)
     console, rounds = Console(), 9 if quick else 41
@@ -399,20 +447,25 @@ def main(
     goals = [
         *against_floor(ds, rounds),
         *against_loop(ds, rounds),
+        one_point(f"ds(y) of one point, M = {N_LAYERS}", ds, rounds),
+        *against_before(rounds),
         *control_loop(2000 if quick else 20_000),
         *rollouts(ds, rounds),
         *gradients(rounds),
         *fits(rounds),
         *sdsef_step(rounds),
-        *deployed.measure(quick),
+        *rivals(ds, rounds),
+        *scale.measure(quick),
     ]
+    outside = [] if quick else deployed.measure(quick)
     curves = growth(quick)
-    load = f"Load average while it ran: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; 1 core is used."
+    load = f"Load average while it ran: {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores."
     powers = [(*map(str, row[:-1]), f"{row[-1]:.2f}") for row in exponents(curves).itertuples(index=False)]
     growth_table = report.table(("grows", "call", "from", "to", "exponent of the time"), powers)
-    summary = "\n\n".join([load, report.goal_table(goals), growth_table])
+    tables = [report.goal_table(goals), growth_table, *([report.goal_table(outside)] if outside else [])]
+    summary = "\n\n".join([load, *tables])
     out.mkdir(parents=True, exist_ok=True)
-    report.write(out / "goals.csv", pd.DataFrame(goals).to_csv(index=False))
+    report.write(out / "goals.csv", pd.DataFrame([*goals, *outside]).to_csv(index=False))
     report.write(out / "growth.csv", curves.to_csv(index=False))
     report.write(out / "summary.md", summary + "\n")
     report.write(out / "environment.json", report.environment())
