@@ -38,6 +38,7 @@ lasa: .venv/installed # LASA handwriting (free for non-commercial academic use),
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	@echo "Installing into .venv (once) ..."
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/python -c 'import latentds; latentds.warmup()'
 	@touch $@
 
 clean: # Remove .venv and results.

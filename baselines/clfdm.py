@@ -107,8 +107,8 @@ class CLFDM(NormalizedDS):
         wish = fading * self.regression(u, nearby(u))
         speed = torch.linalg.vector_norm(wish, dim=-1, keepdim=True)
         wish = wish / (1 + (speed / (SPEED_CAP * self.pace)) ** 8) ** 0.125
-        slope = self.energy.gradient(u)
-        excess = (slope * wish).sum(-1) + DESCENT_RATE * self.energy(u)
+        energy, slope = self.energy.with_gradient(u)
+        excess = (slope * wish).sum(-1) + DESCENT_RATE * energy
         steep = slope.square().sum(-1).clamp(min=torch.finfo(u.dtype).tiny)
         velocity: Tensor = wish - (excess.clamp(min=0) / steep).unsqueeze(-1) * slope
         return velocity
@@ -140,22 +140,22 @@ class AsymmetricQuadratics(nn.Module):
 
     def forward(self, z: Tensor) -> Tensor:
         """(..., n) -> (...)."""
-        pulled, quadratic = self._terms(z)
-        energy: Tensor = (z * pulled).sum(-1) + quadratic[0].clamp(min=0).square().sum(-1)
-        return energy
+        return self.with_gradient(z)[0]
 
     def gradient(self, z: Tensor) -> Tensor:
         """∇V, (..., n) -> (..., n)."""
-        pulled, (values, slopes) = self._terms(z)
-        slope: Tensor = 2 * pulled + (2 * values.clamp(min=0).unsqueeze(-1) * slopes).sum(-2)
-        return slope
+        return self.with_gradient(z)[1]
 
-    def _terms(self, z: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-        """P₀ z, and zᵀ P_l (z - μ_l), (..., L), with its gradient P_l (2 z - μ_l), (..., L, n)."""
+    def with_gradient(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """V and ∇V, (..., n) -> (...), (..., n)."""
         pulled = _times(self.root @ self.root.mT, z) + MIN_EIGENVALUE * z
         here, forms = z.unsqueeze(-2), self.roots @ self.roots.mT
-        values = (here * _times(forms, here - self.centers)).sum(-1)
-        return pulled, (values, _times(forms, 2 * here - self.centers))
+        # zᵀ P_l (z - μ_l), (..., L), with its gradient P_l (2 z - μ_l), (..., L, n)
+        values = (here * _times(forms, here - self.centers)).sum(-1).clamp(min=0)
+        slopes = _times(forms, 2 * here - self.centers)
+        energy: Tensor = (z * pulled).sum(-1) + values.square().sum(-1)
+        slope: Tensor = 2 * pulled + (2 * values.unsqueeze(-1) * slopes).sum(-2)
+        return energy, slope
 
 
 def _times(matrices: Tensor, vectors: Tensor) -> Tensor:

@@ -11,6 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from latentds.arguments import Array, whole_number
+from latentds.kernels.dispatch import no_active_transforms
+from latentds.memo import Memo
 from latentds.resizing import assign, make_room
 
 from .couplings import no_autocast
@@ -101,6 +103,7 @@ class LinearSystems(nn.Module):
         self.root = nn.Parameter(torch.eye(dim, dtype=torch.float64))
         self.turning = nn.Parameter(torch.zeros(1, dim, dim, dtype=torch.float64))
         self.damping = nn.Parameter(torch.zeros(1, dim, dim, dtype=torch.float64))
+        self._memo = Memo[Tensor]()
 
     def metric(self) -> Tensor:
         """P, (n, n)."""
@@ -116,7 +119,14 @@ class LinearSystems(nn.Module):
 
     def forward(self, u: Tensor) -> Tensor:
         """(..., n) -> (..., m, n)."""
-        return (self.matrices() * u.unsqueeze(-2).unsqueeze(-2)).sum(-1)
+        return (self._kept_matrices() * u.unsqueeze(-2).unsqueeze(-2)).sum(-1)
+
+    def _kept_matrices(self) -> Tensor:
+        """The matrices, solved for when a parameter changed: a motion asks thousands of times."""
+        sources: list[Tensor] = [self.root, self.turning, self.damping]
+        if torch.is_grad_enabled() or self.root.is_meta or not no_active_transforms():
+            return self.matrices()
+        return self._memo.of(self.root.dtype, sources, self.matrices)
 
     def assign(self, metric: Array, matrices: Array) -> None:
         """Become the systems with this P, (n, n), and these A_k, (m, n, n), up to what breaks the inequality."""

@@ -147,6 +147,7 @@ class _Search:
         demonstrated = torch.tensor([one.path[0] for one in self.shown], dtype=torch.float64).reshape(-1, ds.dim)
         chosen = self.points[:: max(1, len(self.points) // 32)]
         self.starts = torch.cat([demonstrated.to(self.points), chosen])
+        self.n_few = len(self.shown) + NEARBY_STARTS  # starts of what is costliest to look at
         self.times = torch.linspace(0, self.duration, N_TIMES, dtype=torch.float64).to(self.points.device)
 
     def lines(self) -> list[Line]:
@@ -162,8 +163,7 @@ class _Search:
         if lines[0].verdict == "falsified":
             return [*lines, self._attractor()]
         try:
-            with torch.no_grad():
-                self.paths = self.ds.rollout(self.starts, self.times)
+            self._move()
         except ROLLOUT_ERRORS as error:
             reason = f"{type(error).__name__}: {error}; motions:"
             return [*lines, Line("motions can be computed", "falsified", len(self.starts), 0, reason)]
@@ -172,6 +172,15 @@ class _Search:
             lines += self._maps(self.ds)
         lines += [self._equilibria(), self._positive(), self._descent(), *self._motions(), self._convergence()]
         return [*lines, self._follows()] if self.shown else lines
+
+    def _move(self) -> None:
+        """Motions at ``times``, and from there on to when they must have arrived: one rollout, which may be costly."""
+        later = torch.logspace(-2, math.log10(ARRIVES_WITHIN), N_TIMES - 1, dtype=torch.float64)
+        clock, order = torch.cat([self.times, self.duration * later.to(self.times)]).sort()
+        with torch.no_grad():
+            moved = self.ds.rollout(self.starts, clock)[:, order.argsort()]
+        self.paths = moved[:, :N_TIMES]
+        self.long_paths = torch.cat([moved[:, :1], moved[:, N_TIMES:]], dim=1)
 
     def _finite(self) -> Line:
         broken = ~torch.isfinite(self.velocity).all(-1) | (not self.numbers)  # which no sample may show
@@ -226,8 +235,9 @@ class _Search:
             x = ds.encode(points)
             there = round_trip_gap(ds, points) / self.size
             # In units of the longest way to the goal: of a demonstration, if there is one.
-            way = torch.linalg.vector_norm(ds.encode(self.starts) - ds.frame().attractor, dim=-1, keepdim=True)
-            back = ds.latent_error(self.starts, self.times) * way / way[: len(self.shown) or None].max()
+            few = self.starts[: self.n_few]
+            way = torch.linalg.vector_norm(ds.encode(few) - ds.frame().attractor, dim=-1, keepdim=True)
+            back = ds.latent_error(few, self.times) * way / way[: len(self.shown) or None].max()
         return [
             self._judge("decode inverts encode", there, self.tolerance, "relative error", points),
             self._judge("encode inverts decode", back.flatten(), self.rounding, "error in latent lengths", passed),
@@ -274,8 +284,7 @@ class _Search:
             speeds: Tensor = torch.linalg.vector_norm(self._pace(y), dim=-1).nan_to_num(nan=0.0)
             return speeds
 
-        later = torch.logspace(-2, math.log10(ARRIVES_WITHIN), N_TIMES - 1, dtype=torch.float64)
-        paths = self.ds.rollout(self.starts, self.duration * torch.cat([torch.zeros(1), later]).to(self.times))
+        paths = self.long_paths
         inner = speed(paths[:, 1:-1])
         place = inner.topk(min(4, inner.shape[1]), dim=-1, largest=False).indices + 1
         row = torch.arange(len(paths), device=place.device).unsqueeze(-1)
@@ -286,7 +295,8 @@ class _Search:
         )
         for _ in range(70):
             left, right = high + ratio * (low - high), low + ratio * (high - low)
-            first = (speed(left) < speed(right)).unsqueeze(-1)
+            speeds = speed(torch.stack([left, right]))
+            first = (speeds[0] < speeds[1]).unsqueeze(-1)
             low, high = torch.where(first, low, left), torch.where(first, right, high)
         return low, speed(low)
 
@@ -340,8 +350,8 @@ class _Search:
         with torch.no_grad():
             energy = self.ds.lyapunov(self.paths)
             rise = energy.diff(dim=-1) / energy[:, :1]
+            few = self.starts[: self.n_few]
             apart = restart_gap(self.ds, self.paths, self.times) / self.size
-            few = self.starts[: len(self.shown) + NEARBY_STARTS]
             off = flow_gap(self.ds, few, self.times, FLOW_GAP_LIMIT / 2 * self.size) / self.size
         before = self.paths[:, :-1].flatten(0, 1)
         return [
@@ -383,9 +393,7 @@ class _Search:
         return relative, (uphill * ahead).sum(-1)
 
     def _convergence(self) -> Line:
-        times = torch.tensor([0.0, ARRIVES_WITHIN * self.duration], dtype=torch.float64).to(self.times.device)
-        with torch.no_grad():
-            left = torch.linalg.vector_norm(self.ds.rollout(self.starts, times)[:, -1] - self.goal, dim=-1) / self.size
+        left = torch.linalg.vector_norm(self.long_paths[:, -1] - self.goal, dim=-1) / self.size
         claim = f"every motion arrives within {ARRIVES_WITHIN:g} durations"
         return self._judge(claim, left, 1e-3, "largest distance left", self.starts)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import inspect
 import sys
-import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -42,12 +41,18 @@ def _sources(file: str) -> str:
     return digest.hexdigest()
 
 
+n_compiled = 0
+"""Kernels that this process did not find on disk."""
+
+
 def compiled(function: Callable[..., Any], signature: str) -> Any:
-    """``function`` as machine code, from the cache on disk if it is there; says so if compiling took over a second."""
-    began = time.perf_counter()
+    """``function`` as machine code, from the cache on disk if it is there; the first one that is not is told."""
+    global n_compiled
     kernel = cached(**OPTIONS)(function)
     kernel.compile(signature)
-    seconds = time.perf_counter() - began
-    if seconds > 1 and not kernel.stats.cache_hits:
-        print(f"latentds: compiled {function.__name__} for this CPU in {seconds:.1f} s", file=sys.stderr)
+    if not kernel.stats.cache_hits:
+        if n_compiled == 0:
+            kept = f"kept in {kernel.stats.cache_path}" if kernel.stats.cache_path else "anew in every process"
+            print(f"latentds: compiling for this CPU, about ten seconds for a first fit, {kept}", file=sys.stderr)
+        n_compiled += 1
     return kernel

@@ -80,12 +80,11 @@ _pool: ThreadPoolExecutor | None = None
 _pool_owner = 0
 
 
-def run(kernel_for: Callable[[int], Callable[..., None]], layers: Array, *by_row: Array) -> None:
+def run(kernel: Callable[..., None], layers: Array, *by_row: Array) -> None:
     """Call a kernel on rows of points, on as many cores as torch may use here for a large batch."""
     count = len(by_row[-1])
     if count == 0:
         return
-    kernel = kernel_for(1 if count == 1 else BLOCK)
     cores = min(torch.get_num_threads(), _available_cores()) if count * len(layers) > PARALLEL_THRESHOLD else 1
     if cores == 1:
         kernel(layers, *by_row)

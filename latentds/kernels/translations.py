@@ -42,7 +42,7 @@ def inverse(layers: Array, y: Tensor) -> Tensor:
     """ψ⁻¹(y)."""
     points = rows_of(y)
     out = np.empty_like(points)
-    run(partial(inverse_kernel, points.shape[1]), layers, points, out)
+    run(inverse_kernel(points.shape[1]), layers, points, out)
     return tensor_of(out, y, y.shape)
 
 
@@ -61,7 +61,7 @@ def _swept(layers: Array, points: Array, tangents: Array, n_tangents: int) -> tu
     """ψ of points (m, n), and J_ψ of so many tangents at each, (m, n·T) or (1, n·T)."""
     count, dim = points.shape
     moved, pushed = np.empty_like(points), np.empty((count, dim * n_tangents))
-    run(partial(forward_kernel, dim, n_tangents), layers, points, tangents, moved, pushed)
+    run(forward_kernel(dim, n_tangents), layers, points, tangents, moved, pushed)
     return moved, pushed
 
 
@@ -128,7 +128,7 @@ def _summed(kernel: Callable[..., None], layers: Array, points: Array, *by_row: 
             kernel(layers, *rows, sums)
             parts.append((points[cut:].ctypes.data, sums))
 
-    run(lambda block: sweep, layers, points, *by_row)
+    run(sweep, layers, points, *by_row)
     # Block by block in the order of the points, so that the sum is the same to the last bit on any number of cores.
     total = np.zeros(shape)
     for _, part in sorted(parts, key=lambda part: part[0]):
@@ -207,10 +207,9 @@ def pack(centers: Array, log_widths: Array, strengths: Array) -> Array:
 
 
 @cache
-def forward_kernel(dim: int, tangents: int, block: int) -> Any:
+def forward_kernel(dim: int, tangents: int) -> Any:
     """ψ of points, and J_ψ of so many tangents at each: x (m, n) and t (m, n·T) or (1, n·T) -> x, t."""
-    width = WIDTH if block > 1 else 1
-    first_tangent = (dim + 1) * block
+    width, block, first_tangent = WIDTH, BLOCK, (dim + 1) * BLOCK
 
     def sweep(layers: Array, x: Array, t: Array, x_out: Array, t_out: Array) -> None:
         held = np.empty((1 + dim + dim * tangents) * block)  # squared distance; coordinates; tangents
@@ -267,13 +266,13 @@ def forward_kernel(dim: int, tangents: int, block: int) -> Any:
 
 
 @cache
-def inverse_kernel(dim: int, block: int) -> Any:
+def inverse_kernel(dim: int) -> Any:
     """ψ⁻¹ of points: (m, n) -> (m, n).
 
     Each layer is one root of s = exp(-(A s² - 2 B s + C)) in [0, 1], A = ρ²‖v‖², B = ρ² v·(y-c), C = ρ²‖y-c‖². Vectors
     of points whose roots are found drop out of the iteration.
     """
-    width = WIDTH if block > 1 else 1
+    width, block = WIDTH, BLOCK
     at_b, at_s, at_low, at_high, at_x = (row * block for row in range(1, 6))
 
     def inverse(layers: Array, y: Array, x_out: Array) -> None:
