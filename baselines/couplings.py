@@ -295,7 +295,7 @@ def _decode_by_kernel(packed: Arrays, x: Tensor) -> Tensor:
     W, *rest = packed
     points, kernel = rows_of(x), decode_kernel()
     out = np.empty_like(points)
-    run(lambda block: lambda W, *rows: kernel(W, *rest, *rows), W, points, out)
+    run(lambda W, *rows: kernel(W, *rest, *rows), W, points, out)
     return tensor_of(out, x, x.shape)
 
 
@@ -303,7 +303,7 @@ def _encode_by_kernel(packed: Arrays, y: Tensor) -> Tensor:
     W, *rest = packed
     points, kernel = rows_of(y), encode_kernel()
     out, nothing = np.empty_like(points), np.empty((0, 0, 0))
-    run(lambda block: lambda W, *rows: kernel(W, *rest, *rows, nothing), W, points, out)
+    run(lambda W, *rows: kernel(W, *rest, *rows, nothing), W, points, out)
     return tensor_of(out, y, y.shape)
 
 
@@ -312,7 +312,7 @@ def _kept_by_kernel(parameters: Parameters, y: Tensor) -> tuple[Tensor, tuple[Ar
     W, b, A, box = arrays_of(parameters)
     points, kernel, wide = rows_of(y), encode_kernel(), (y.shape[-1] + 1) // 2
     out, kept = np.empty_like(points), np.empty((len(points), len(b), wide * (1 + wide)))
-    run(lambda block: lambda W, *rows: kernel(W, b, A, box, *rows), W, points, out, kept)
+    run(lambda W, *rows: kernel(W, b, A, box, *rows), W, points, out, kept)
     return tensor_of(out, y, y.shape), (box, kept)
 
 

@@ -255,7 +255,7 @@ def _speed_by_kernel(packed: tuple[Array, Array, Array], y: Tensor) -> Tensor:
     weights, ends, box = packed
     points = rows_of(y)
     out = np.empty(len(points))
-    run(lambda block: lambda weights, *rows: speed_kernel()(box, weights, ends, *rows), weights, points, out)
+    run(lambda weights, *rows: speed_kernel()(box, weights, ends, *rows), weights, points, out)
     return torch.from_numpy(out).to(y.dtype).reshape(y.shape[:-1])
 
 

@@ -290,7 +290,7 @@ def fits(rounds: int) -> list[Goal]:
 
 def sdsef_step(rounds: int) -> list[Goal]:
     ds = SDSEF(3, n_layers=10, n_features=150, seed=0).float()
-    psi, network = ds.diffeomorphism, ds.dynamics.network
+    psi, log_speed = ds.diffeomorphism, ds.dynamics.log_speed
     with torch.no_grad():
         for parameter in psi.parameters():
             parameter.copy_(0.01 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0)))
@@ -314,7 +314,7 @@ def sdsef_step(rounds: int) -> list[Goal]:
 
     def step(direction: Callable[[], Tensor]) -> Tensor:
         optimizer.zero_grad()
-        loss = nn.functional.smooth_l1_loss(-network(points).exp() * direction(), wanted)
+        loss = nn.functional.smooth_l1_loss(-log_speed(points).exp().unsqueeze(-1) * direction(), wanted)
         loss.backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         return torch.cat([p.grad.flatten() for p in psi.parameters() if p.grad is not None])

