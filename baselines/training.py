@@ -146,7 +146,7 @@ def descend(
 def descend_smoothly(
     loss: Callable[[], Tensor], parameters: Mapping[nn.Parameter, float], iterations: int
 ) -> tuple[float, ...]:
-    """Minimise a smooth loss of all samples at once by SciPy's L-BFGS; the parameters end where it ends.
+    """Minimise a smooth loss of all samples at once by L-BFGS; the parameters end where it ends.
 
     Args:
         loss: () -> (), of the parameters as they are; float64.

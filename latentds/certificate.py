@@ -147,7 +147,6 @@ class _Search:
         demonstrated = torch.tensor([one.path[0] for one in self.shown], dtype=torch.float64).reshape(-1, ds.dim)
         chosen = self.points[:: max(1, len(self.points) // 32)]
         self.starts = torch.cat([demonstrated.to(self.points), chosen])
-        self.n_few = len(self.shown) + NEARBY_STARTS  # starts of what is costliest to look at
         self.times = torch.linspace(0, self.duration, N_TIMES, dtype=torch.float64).to(self.points.device)
 
     def lines(self) -> list[Line]:
@@ -235,9 +234,8 @@ class _Search:
             x = ds.encode(points)
             there = round_trip_gap(ds, points) / self.size
             # In units of the longest way to the goal: of a demonstration, if there is one.
-            few = self.starts[: self.n_few]
-            way = torch.linalg.vector_norm(ds.encode(few) - ds.frame().attractor, dim=-1, keepdim=True)
-            back = ds.latent_error(few, self.times) * way / way[: len(self.shown) or None].max()
+            way = torch.linalg.vector_norm(ds.encode(self.starts) - ds.frame().attractor, dim=-1, keepdim=True)
+            back = ds.latent_error(self.starts, self.times) * way / way[: len(self.shown) or None].max()
         return [
             self._judge("decode inverts encode", there, self.tolerance, "relative error", points),
             self._judge("encode inverts decode", back.flatten(), self.rounding, "error in latent lengths", passed),
@@ -350,7 +348,7 @@ class _Search:
         with torch.no_grad():
             energy = self.ds.lyapunov(self.paths)
             rise = energy.diff(dim=-1) / energy[:, :1]
-            few = self.starts[: self.n_few]
+            few = self.starts[: len(self.shown) + NEARBY_STARTS]
             apart = restart_gap(self.ds, self.paths, self.times) / self.size
             off = flow_gap(self.ds, few, self.times, FLOW_GAP_LIMIT / 2 * self.size) / self.size
         before = self.paths[:, :-1].flatten(0, 1)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ARRIVE", "Comparison", "environment", "findings", "percent", "verdict", "write"]
 
-PACKAGES = ("latentds", "torch", "numpy", "scipy", "numba", "pandas", "joblib")
+PACKAGES = ("latentds", "torch", "numpy", "scipy", "numba", "fastdtw", "pandas", "joblib")
 
 
 def write(
