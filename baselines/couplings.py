@@ -91,18 +91,15 @@ class AffineCouplings(Diffeomorphism):
         """As in the base class; the map also takes a stack of tangents at once, (..., *y.shape)."""
         check_points(self.dim, y, "y")
         parameters = self.held()
-        if not self._can_use_kernel(y):
+        differentiated = torch.is_grad_enabled() and any(part.requires_grad for part in (y, *parameters))
+        if differentiated or not self._can_use_kernel(y):
             return _linearize(parameters, y)
         x, kept = _kept_by_kernel(parameters, y)
-        if torch.is_grad_enabled() and any(part.requires_grad for part in (y, *parameters)):
-            found = x
-            x = evaluate(Operation(lambda packed, y: found, _encode), None, parameters, y)
-        pushed = Operation(_push_by_kernel, _push)
 
         def push(tangent: Tensor) -> Tensor:
             if not self._can_use_kernel(y, tangent):
-                return _push(parameters, y, tangent)
-            return evaluate(pushed, kept, parameters, y, tangent)
+                return _linearize(parameters, y)[1](tangent)
+            return evaluate(_PUSH, kept, parameters, y, tangent)
 
         return x, push
 
@@ -268,11 +265,6 @@ def _linearize(parameters: Parameters, y: Tensor) -> tuple[Tensor, Callable[[Ten
     return _join(parts), push
 
 
-def _push(parameters: Parameters, y: Tensor, tangent: Tensor) -> Tensor:
-    """J_ψ t at y = ψ(x)."""
-    return _linearize(parameters, y)[1](tangent)
-
-
 def _join(parts: list[Tensor]) -> Tensor:
     dim = parts[0].shape[-1] + parts[1].shape[-1]
     even, odd = parts[0], nn.functional.pad(parts[1], (0, dim % 2))
@@ -327,6 +319,7 @@ def _push_by_kernel(kept: tuple[Array, Array], y: Tensor, t: Tensor) -> Tensor:
 
 _DECODE = Operation(_decode_by_kernel, lambda parameters, x: _decode_with_log_det(parameters, x)[0])
 _ENCODE = Operation(_encode_by_kernel, _encode)
+_PUSH = Operation(_push_by_kernel, lambda parameters, y, tangent: _linearize(parameters, y)[1](tangent))
 
 
 def no_autocast(like: Tensor) -> AbstractContextManager[Any]:
