@@ -145,12 +145,13 @@ static inline void ${NAME}_velocity$f(const $real y[${NAME}_DIM], $real velocity
             for (int k = 0; k < reads; k++) slopes[j][m][k] = grown * steep[0][m][k] + steep[1][m][k];
         }
     }
-    for (int d = 0; d < ${NAME}_DIM; d++) { /* the latent velocity, but for its length */
+    for (int d = 0; d < ${NAME}_DIM; d++) { /* the latent velocity */
         velocity[d] = x[d] - ${NAME}_latent_goal$f[d];
         squared += velocity[d] * velocity[d];
     }
     const $real distance = sqrt$f(squared);
     const $real pull = -${NAME}_speed$f(u) / (distance > $guard ? distance : $guard);
+    for (int d = 0; d < ${NAME}_DIM; d++) velocity[d] *= pull;
     for (int j = $layers - 1; j >= 0; j--) { /* and back again */
         $real *const p = velocity + j % 2, *const q = velocity + 1 - j % 2;
         const int reads = (${NAME}_DIM + 1 - j % 2) / 2, moves = ${NAME}_DIM - reads;
@@ -159,6 +160,6 @@ static inline void ${NAME}_velocity$f(const $real y[${NAME}_DIM], $real velocity
             q[2 * m] *= shrinking[j][m];
         }
     }
-    for (int d = 0; d < ${NAME}_DIM; d++) velocity[d] = pull * ${NAME}_scale$f[d] * velocity[d] + not_finite;
+    for (int d = 0; d < ${NAME}_DIM; d++) velocity[d] = ${NAME}_scale$f[d] * velocity[d] + not_finite;
 }
 """)
