@@ -1,4 +1,4 @@
-"""The velocity field of SDS-EF as numbers: for a compiled function, and in C99."""
+"""The velocity field of SDS-EF for what computes it without torch: a compiled function, and C99."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .coupling_sweeps import LEAK, N_UNITS, field_kernel, room_for
 
 
 class CouplingTables(NamedTuple):
-    """As :func:`field_kernel` takes them."""
+    """The velocity field of SDS-EF as numbers: as :func:`field_kernel` takes them."""
 
     frequencies: Array
     phases: Array
@@ -65,11 +65,11 @@ class CouplingTables(NamedTuple):
         read = [(dim + 1 - layer % 2) // 2 for layer in range(n_layers)]
         W = np.split(self.frequencies.reshape(-1, count), 2 * np.cumsum(read)[:-1])
         A = np.split(self.amplitudes.reshape(-1, count), 2 * np.cumsum(dim - np.array(read))[:-1])
-        of_layers = [
+        of_layers: list[Array] = [
             np.concatenate([b[:, None], w.reshape(2, -1, count), a.reshape(2, -1, count)], 1)
             for b, w, a in zip(self.phases, W, A, strict=True)
         ]
-        return np.stack(of_layers).swapaxes(2, 3)
+        return np.swapaxes(of_layers, 2, 3)
 
     def _units(self) -> list[Array]:
         """Of each layer of the speed network (out, 1 + in): a row of bias and weights for every unit."""

@@ -92,7 +92,7 @@ class SDSEF(FlowDS):
             return None
         exact = copy.deepcopy(self).to("cpu", torch.float64)
         frame, dynamics = exact.frame(), exact.dynamics
-        latent = np.append(frame.attractor.detach().numpy(), LINEAR_WITHIN * float(frame.length))
+        latent = np.append(frame.attractor.detach().numpy(), LINEAR_WITHIN * float(frame.length.detach()))
         ends = np.append(dynamics.log_speed_range.numpy(), float(dynamics.duration))
         arrays = arrays_of(exact.diffeomorphism.held())
         return CouplingTables(*arrays, dynamics.weights.detach().numpy(), ends, latent)

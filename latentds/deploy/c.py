@@ -18,13 +18,14 @@ def write(ds: VelocityField, path: str | os.PathLike[str], *, name: str) -> None
 
     ``NAME_velocity`` agrees with this package to rounding. ``NAME_velocityf`` computes in float alone, for processors
     without double; it is off by as much as the velocity changes when the position is rounded to float: 1e-7 to 1e-4 of
-    the largest speed as the field is steep, more where ψ nearly folds. Both take at most eight steps a layer, work on
-    the stack, and keep nothing between calls, so that threads may share them. ``velocity`` may be ``y`` itself. A
-    position that is not finite has a velocity of NaN, except under ``-ffast-math``.
+    the largest speed as the field is steep, more where ψ nearly folds and within a thousandth of SDS-EF's way to the
+    goal. Both do bounded work, at most eight steps a layer, on the stack, and keep nothing between calls, so that
+    threads may share them. ``velocity`` may be ``y`` itself. A position that is not finite has a velocity of NaN,
+    except under ``-ffast-math``.
 
     Args:
-        ds: a system of locally weighted translations with the dynamics of this package, fitted or not, in any dtype
-            and on any device.
+        ds: a system of locally weighted translations with the dynamics of this package, or SDS-EF; fitted or not, in
+            any dtype and on any device.
         path: the file, by custom ``*.h``; it is there whole or not at all.
         name: what the names in it begin with, NAME above: letters, digits and underscores after a first letter.
 
