@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numba
 import numpy as np
@@ -344,27 +344,3 @@ def field_kernel() -> Any:
     flat, table, stack = "float64[::1]", "float64[:, ::1]", "float64[:, :, ::1]"
     arrays = [flat, stack, flat, table, flat, flat, flat, table, table, table, table]
     return compiled(field, f"boolean({', '.join(arrays)})")
-
-
-class CouplingTables(NamedTuple):
-    """The velocity field of SDS-EF as numbers: as :func:`field_kernel` takes them."""
-
-    frequencies: Array
-    phases: Array
-    amplitudes: Array
-    box: Array
-    network: Array
-    ends: Array
-    latent: Array
-
-    def packed(self) -> tuple[Array, ...]:
-        return tuple(self)
-
-    def kernel(self, tangents: int) -> Any:
-        return field_kernel() if tangents == 0 else None
-
-    def room(self) -> Array:
-        dim, (n_layers, _, count) = len(self.latent) - 1, self.phases.shape
-        wide = (dim + 1) // 2
-        size = 2 * dim + n_layers * wide * (1 + wide) + int(room_for(dim, count)) + 2 * N_UNITS + 2 * WIDTH
-        return np.empty((-(-size // (dim + 2)) + 1, dim + 2))

@@ -20,7 +20,8 @@ from latentds.kernels.dispatch import can_use_kernel, rows_of, run
 from latentds.kernels.functions import Operation, evaluate
 from latentds.kernels.private import is_altered
 
-from .coupling_sweeps import LEAK, N_UNITS, CouplingTables, speed_kernel
+from .coupling_sweeps import LEAK, N_UNITS, speed_kernel
+from .coupling_tables import CouplingTables
 from .couplings import AffineCouplings, arrays_of, no_autocast
 from .flows import FlowDS, FlowDynamics, Normalized, descend_bending, quickest_linearize, ray_loss, unit_vector
 from .networks import linear, seeded_generator
@@ -91,7 +92,7 @@ class SDSEF(FlowDS):
             return None
         exact = copy.deepcopy(self).to("cpu", torch.float64)
         frame, dynamics = exact.frame(), exact.dynamics
-        latent = np.append(frame.attractor.detach().numpy(), LINEAR_WITHIN * float(frame.length))
+        latent = np.append(frame.attractor.detach().numpy(), LINEAR_WITHIN * float(frame.length.detach()))
         ends = np.append(dynamics.log_speed_range.numpy(), float(dynamics.duration))
         arrays = arrays_of(exact.diffeomorphism.held())
         return CouplingTables(*arrays, dynamics.weights.detach().numpy(), ends, latent)

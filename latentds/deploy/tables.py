@@ -15,6 +15,7 @@ from ..diffeomorphism import Diffeomorphism
 from ..dynamics import Frame, LatentDynamics
 from ..kernels.velocity import velocity_kernel
 from ..tabulated import LawTable
+from . import c_text
 
 Self = TypeVar("Self", bound="VelocityField")
 
@@ -37,6 +38,9 @@ class Compiled(Protocol):
 
     def room(self) -> Array:
         """What the function works in; its last row is for the shift (n), the speed and the limit."""
+
+    def in_c(self, name: str, real: str) -> str:
+        """The field in C99: ``NAME_velocity`` if ``real`` is "double", ``NAME_velocityf`` if it is "float"."""
 
 
 class FieldTables(NamedTuple):
@@ -62,6 +66,9 @@ class FieldTables(NamedTuple):
         dim = self.goal.shape[1]
         return np.empty((len(self.layers) + 2 + dim, dim + 2))
 
+    def in_c(self, name: str, real: str) -> str:
+        return c_text.translations(*self, name, real)
+
 
 class VelocityField(Protocol):
     """What is deployed: any :class:`~latentds.StableDS`."""
@@ -78,25 +85,37 @@ class VelocityField(Protocol):
     def requires_grad_(self: Self, requires_grad: bool = True) -> Self: ...
 
 
-def tables_of(ds: VelocityField) -> FieldTables:
-    """The tables of a system, for an exporter.
+def compiled_of(ds: VelocityField) -> Compiled:
+    """The numbers of a system, of whatever kind, for an exporter.
 
     Raises:
-        ValueError: if it has none, naming what cannot be written so, or if a number in them is not finite.
+        ValueError: if it has none, naming what cannot be written so, or if one of them is not finite.
     """
     tables = ds.tables()
-    if not isinstance(tables, FieldTables):
-        psi, dynamics, frame = (getattr(ds, name, None) for name in ("diffeomorphism", "dynamics", "frame"))
-        if isinstance(psi, Diffeomorphism) and psi.table() is None:
-            missing = f"its diffeomorphism {type(psi).__name__} has no table()"
-        elif isinstance(dynamics, LatentDynamics) and frame is not None and dynamics.table(frame()) is None:
-            missing = f"its dynamics {type(dynamics).__name__}, or a time law of theirs, have no table()"
-        else:
-            missing = "its velocity is its own, and its tables() do not say how to write it"
-        raise ValueError(f"ds: expected a system that can be written as tables, got {type(ds).__name__}: {missing}")
+    if tables is None:
+        raise _not_written(ds)
     if not all(np.isfinite(table).all() for table in tables.packed()):
         raise ValueError(f"ds: expected finite parameters, got {type(ds).__name__} with NaN or inf")
     return tables
+
+
+def tables_of(ds: VelocityField) -> FieldTables:
+    """As :func:`compiled_of`, of a system of translations; refuses any other."""
+    tables = compiled_of(ds)
+    if not isinstance(tables, FieldTables):
+        raise _not_written(ds)
+    return tables
+
+
+def _not_written(ds: VelocityField) -> ValueError:
+    psi, dynamics, frame = (getattr(ds, name, None) for name in ("diffeomorphism", "dynamics", "frame"))
+    if isinstance(psi, Diffeomorphism) and psi.table() is None:
+        missing = f"its diffeomorphism {type(psi).__name__} has no table()"
+    elif isinstance(dynamics, LatentDynamics) and frame is not None and dynamics.table(frame()) is None:
+        missing = f"its dynamics {type(dynamics).__name__}, or a time law of theirs, have no table()"
+    else:
+        missing = "its velocity is its own, and its tables() do not say how to write it"
+    return ValueError(f"ds: expected a system that can be written as tables, got {type(ds).__name__}: {missing}")
 
 
 def describe(ds: VelocityField) -> dict[str, str]:

@@ -69,13 +69,56 @@ def test_equal_for_every_law(dim, dynamics, make_field, positions, run, assert_s
 def test_float_errs_as_a_rounding_of_the_position_would(dynamics, make_field, positions, run):
     ds = make_field(3, dynamics)
     points = positions(ds).float()
-    velocities = torch.from_numpy(run(ds, points)).double()
+    assert_errs_as_rounding_would(run(ds, points), ds, points, 3)
+
+
+def assert_errs_as_rounding_would(velocities, ds, points, times):
+    """No more than ``times`` what rounding the positions to float changes the velocity by."""
     y = points.double()
     with torch.no_grad():
         expected, jacobians = ds(y), torch.func.vmap(torch.func.jacfwd(ds))(y)
         rounding = jacobians.norm(dim=(1, 2)) * y.norm(dim=-1) * torch.finfo(torch.float32).eps / 2
         largest = expected.norm(dim=-1).max()
-        assert ((velocities - expected).norm(dim=-1) <= 3 * rounding + 1e-6 * largest).all()
+    error = (torch.from_numpy(velocities).double() - expected).norm(dim=-1)
+    assert (error <= times * rounding + 1e-6 * largest).all()
+
+
+@pytest.mark.parametrize("n_layers", [1, 10])
+@pytest.mark.parametrize("dim", [1, 2, 3, 7])
+def test_sdsef(dim, n_layers, run, draw, assert_same_velocity):
+    # Every layer rounds the latent point, in a product and a sum, and near the goal that counts a thousandfold: the
+    # speed falls to 0 within a thousandth of the way. Points lie as near as motions do: the features' angles grow with
+    # distance, from layer to layer, and far away no digit of their cosines is left.
+    ds = coupled(dim, n_layers)
+    reach = torch.logspace(-9, 0.3, 60, dtype=torch.float64).unsqueeze(-1)
+    points = ds.attractor + reach * torch.randn(60, dim, generator=draw, dtype=torch.float64)
+    assert_same_velocity(run(ds, points), ds, points, 1e-11)
+    assert_errs_as_rounding_would(run(ds, points.float()), ds, points.float(), 2 + 2 * n_layers)
+
+
+@pytest.mark.parametrize("dim", [1, 2])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_sdsef_anywhere(dtype, dim, run, assert_spoils_its_row_alone):
+    ds = coupled(dim, 2)
+    assert_spoils_its_row_alone(run, ds, dtype)
+    goal, far = ds.attractor.to(dtype), {torch.float64: 1e200, torch.float32: 1e30}[dtype]
+    points = torch.stack([goal, goal + torch.finfo(dtype).tiny, torch.full_like(goal, far)])
+    velocities = run(ds, points)
+    assert np.abs(velocities[:2]).max() < {torch.float64: 1e-9, torch.float32: 1e-2}[dtype]
+    assert np.isfinite(velocities).all()
+    assert np.array_equal(run(ds, points, in_place=True), velocities)
+
+
+def coupled(dim, n_layers):
+    """An SDS-EF with layers as a fit leaves them, and an attractor off the origin."""
+    ds, draw = SDSEF(dim, n_layers=n_layers, n_features=50, seed=dim), torch.Generator().manual_seed(dim)
+    with torch.no_grad():
+        ds.diffeomorphism.amplitudes.normal_(0, 0.015, generator=draw)
+        ds.diffeomorphism.center.normal_(generator=draw)
+        ds.diffeomorphism.scale.uniform_(0.5, 2, generator=draw)
+        ds.attractor.normal_(generator=draw)
+        ds.start.copy_(ds.attractor + 1)
+    return ds
 
 
 def test_ten_thousand_points(make_field, positions, run, assert_same_velocity):
@@ -149,9 +192,23 @@ def test_bad_names_are_refused(name, make_field, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+class Doubled(ChebyshevDS):
+    def forward(self, y):
+        return 2 * super().forward(y)
+
+
 def test_what_cannot_be_written_is_refused(make_field, tmp_path):
-    with pytest.raises(ValueError, match="got SDSEF: its diffeomorphism AffineCouplings has no"):
-        c.write(SDSEF(2, n_layers=2, n_features=5, seed=0), tmp_path / "field.h", name="field")
+    with pytest.raises(ValueError, match="got Doubled: its velocity is its own, and its tables"):
+        c.write(Doubled(2, n_layers=2), tmp_path / "field.h", name="field")
+    with pytest.raises(ValueError, match="got MovedDS: its velocity is its own, and its tables"):
+        c.write(coupled(2, 2).with_goal(torch.ones(2)), tmp_path / "field.h", name="field")
+    ds = coupled(2, 2)
+    ds.diffeomorphism.center[0] = torch.nan
+    with pytest.raises(ValueError, match="ds: expected finite parameters, got SDSEF with NaN or inf"):
+        c.write(ds, tmp_path / "field.h", name="field")
+    ds.diffeomorphism.center[0] = 1e60
+    with pytest.raises(ValueError, match="ds: expected parameters that a float can hold, got 1e"):
+        c.write(ds, tmp_path / "field.h", name="field")
     ds = make_field(2)
     with torch.no_grad():
         ds.diffeomorphism.log_widths.fill_(60.0)
