@@ -13,6 +13,7 @@ import torch
 import latentds
 from baselines import FDM, SDSEF
 from latentds import ChebyshevDS, TubeDS, datasets
+from latentds.dynamics import TubeDynamics
 from latentds.kernels.dispatch import reference
 from latentds.testing import wavy_motion
 from latentds.time_law import KnottedLaw
@@ -315,6 +316,32 @@ def test_the_velocity_of_one_point_sees_every_change(change):
     with reference():
         torch.testing.assert_close(after, ds(y), rtol=1e-9, atol=1e-12, equal_nan=True)
     assert not torch.equal(before, after)
+
+
+class Scaled(TubeDynamics):
+    """Dynamics whose table is made of an array that is no buffer."""
+
+    def __init__(self, dynamics):
+        super().__init__(dynamics.law, dynamics.transverse_law)
+        self.factor = torch.ones(1, dtype=torch.float64)
+
+    def forward(self, x, y, frame):
+        return self.factor * super().forward(x, y, frame)
+
+    def table(self, frame):
+        goal, *laws = TubeDynamics.table(self, frame)
+        return goal, *(law.faster(float(self.factor)) for law in laws)
+
+
+def test_the_velocity_of_one_point_sees_what_an_array_became():
+    shown = wavy_motion(2)
+    ds = TubeDS(2, n_layers=20).fit(shown).requires_grad_(False)
+    y = shown.start + 0.05
+    before = ds(y)
+    ds.dynamics = Scaled(ds.dynamics)
+    torch.testing.assert_close(ds(y), before, rtol=1e-9, atol=1e-12)
+    ds.dynamics.factor *= 2
+    torch.testing.assert_close(ds(y), 2 * before, rtol=1e-9, atol=1e-12)
 
 
 def test_the_velocity_of_one_point_has_every_shape_dtype_and_derivative():

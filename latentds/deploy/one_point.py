@@ -36,7 +36,8 @@ class OnePoint:
         structure, tensors = structure_of(ds), tensors_of(ds)
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (point, *tensors)):
             return None
-        if structure is None or not all(tensor.is_cpu for tensor in tensors):
+        known_by_value = structure is not None and object not in map(type, structure)
+        if not (known_by_value and all(tensor.is_cpu for tensor in tensors)):
             return None
         known = self._memo.of(structure, tensors, lambda: _compiled(ds))
         if known is None:

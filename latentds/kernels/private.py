@@ -58,6 +58,9 @@ def tensors_of(module: nn.Module) -> list[Tensor]:
     return [tensor for part in held for tensor in part.values() if tensor is not None]
 
 
+KNOWN_BY_VALUE = (bool, int, float, str, type(None), nn.Module)
+
+
 def is_altered(module: nn.Module) -> bool:
     """Whether hooks, or methods set on instances, make a module or one in it compute something else than its class."""
     return structure_of(module) is None
@@ -66,7 +69,8 @@ def is_altered(module: nn.Module) -> bool:
 def structure_of(module: nn.Module) -> list[object] | None:
     """The classes of a module and of those in it, with what they keep beside tensors; None if it :func:`is_altered`.
 
-    Equal as long as no attribute is another one.
+    Equal as long as no attribute is another one. What may change and stay the same object, all but numbers, strings and
+    modules, has an ``object()`` in its place, which is equal to none.
     """
     found: list[object] = []
     for part in module.modules():
@@ -78,7 +82,7 @@ def structure_of(module: nn.Module) -> list[object] | None:
             if name[0] != "_":
                 if callable(value) and callable(getattr(own, name, None)):
                     return None
-                found.append(value)
+                found.append(value if isinstance(value, KNOWN_BY_VALUE) else object())
     return found
 
 
