@@ -35,7 +35,7 @@ class CouplingTables(NamedTuple):
     def room(self) -> Array:
         dim, (n_layers, _, count) = len(self.latent) - 1, self.phases.shape
         wide = (dim + 1) // 2
-        size = 2 * dim + n_layers * wide * (1 + wide) + int(room_for(dim, count)) + 2 * N_UNITS + 2 * WIDTH
+        size = 2 * dim + n_layers * wide * (1 + wide) + room_for.py_func(dim, count) + 2 * N_UNITS + 2 * WIDTH
         return np.empty((-(-size // (dim + 2)) + 1, dim + 2))
 
     def in_c(self, name: str, real: str) -> str:

@@ -63,13 +63,14 @@ class AffineCouplings(Diffeomorphism):
         self.dim = whole_number(dim, "dim", at_least=1)
         self.n_layers = whole_number(n_layers, "n_layers", at_least=1)
         self.n_features = whole_number(n_features, "n_features", at_least=1)
-        positive(sigma, "sigma")
+        sigma = positive(sigma, "sigma")
         frequencies, phases = [], []
-        for layer in range(n_layers):
-            drawn = torch.randn(2, n_features, _n_read(dim, layer), dtype=torch.float64, generator=generator) / sigma
+        reads = [_n_read(self.dim, layer) for layer in range(self.n_layers)]
+        for n_read in reads:
+            drawn = torch.randn(2, self.n_features, n_read, dtype=torch.float64, generator=generator) / sigma
             frequencies.append(drawn.mT.flatten())
-            phases.append(2 * math.pi * torch.rand(2, n_features, dtype=torch.float64, generator=generator))
-        n_amplitudes = sum(2 * n_features * (dim - _n_read(dim, layer)) for layer in range(n_layers))
+            phases.append(2 * math.pi * torch.rand(2, self.n_features, dtype=torch.float64, generator=generator))
+        n_amplitudes = 2 * self.n_features * sum(self.dim - n_read for n_read in reads)
         self.register_buffer("frequencies", torch.cat(frequencies))
         self.register_buffer("phases", torch.stack(phases))
         self.amplitudes = nn.Parameter(torch.zeros(n_amplitudes, dtype=torch.float64))
@@ -272,7 +273,6 @@ def _join(parts: list[Tensor]) -> Tensor:
 
 
 # --- by kernels -------------------------------------------------------------------------------------------------------
-
 
 Arrays = tuple[Array, Array, Array, Array]
 

@@ -126,7 +126,7 @@ class LinearSystems(nn.Module):
         sources: list[Tensor] = [self.root, self.turning, self.damping]
         if torch.is_grad_enabled() or self.root.is_meta or not no_active_transforms():
             return self.matrices()
-        return self._memo.of(self.root.dtype, sources, self.matrices)
+        return self._memo.of(None, sources, self.matrices)
 
     def assign(self, metric: Array, matrices: Array) -> None:
         """Become the systems with this P, (n, n), and these A_k, (m, n, n), up to what breaks the inequality."""

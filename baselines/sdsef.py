@@ -88,6 +88,7 @@ class SDSEF(FlowDS):
     def tables(self) -> CouplingTables | None:
         own = type(self).forward is LatentDS.forward and type(self.dynamics) is NormalizedDescent
         known = own and type(self.diffeomorphism) is AffineCouplings and not is_altered(self)
+        known = known and self.dynamics.psi is self.diffeomorphism  # of which the speed is read, too
         if not (known and self.diffeomorphism.fits() and self.dynamics.fits()):
             return None
         exact = copy.deepcopy(self).to("cpu", torch.float64)

@@ -545,10 +545,14 @@ class LatentDS(StableDS):
         psi, attractor = self.diffeomorphism, self.attractor
         sources = [attractor, self.start, *tensors_of(psi)]
         differentiated = torch.is_grad_enabled() and any(source.requires_grad for source in sources)
-        structure = structure_of(psi)
-        if differentiated or attractor.is_meta or structure is None or not no_active_transforms():
+        if (
+            differentiated
+            or attractor.is_meta
+            or not no_active_transforms()
+            or (structure := structure_of(psi)) is None
+        ):
             return None
-        return self._memo.of([psi, attractor.dtype, *structure], sources, self._new_frame)
+        return self._memo.of([psi, *structure], sources, self._new_frame)
 
     def _new_frame(self) -> Frame:
         return Frame.between(*self.diffeomorphism.inverse(self._ends()).unbind())

@@ -348,8 +348,8 @@ class _Search:
         with torch.no_grad():
             energy = self.ds.lyapunov(self.paths)
             rise = energy.diff(dim=-1) / energy[:, :1]
-            few = self.starts[: len(self.shown) + NEARBY_STARTS]
             apart = restart_gap(self.ds, self.paths, self.times) / self.size
+            few = self.starts[: len(self.shown) + NEARBY_STARTS]
             off = flow_gap(self.ds, few, self.times, FLOW_GAP_LIMIT / 2 * self.size) / self.size
         before = self.paths[:, :-1].flatten(0, 1)
         return [

@@ -211,7 +211,7 @@ class LocallyWeightedTranslations(Diffeomorphism):
         """
         if not translations.can_use_kernel(self, points):
             return None
-        parameters: Any = private.held_parameters(self, translations.PARAMETERS)
+        parameters: Any = private.held_tensors(self, translations.PARAMETERS)
         packed = translations.packed(parameters)
         return (packed, parameters) if math.isfinite(packed.sum()) else None
 

@@ -33,11 +33,11 @@ class OnePoint:
         assert isinstance(ds, nn.Module)
         if not (no_active_transforms() and is_plain(point, ds.attractor.dtype) and point.numel() == ds.dim):
             return None
-        structure, tensors = structure_of(ds), tensors_of(ds)
+        tensors = tensors_of(ds)
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in (point, *tensors)):
             return None
-        known_by_value = structure is not None and object not in map(type, structure)
-        if not (known_by_value and all(tensor.is_cpu for tensor in tensors)):
+        structure = structure_of(ds) if all(tensor.is_cpu for tensor in tensors) else None
+        if structure is None or object in map(type, structure):
             return None
         known = self._memo.of(structure, tensors, lambda: _compiled(ds))
         if known is None:

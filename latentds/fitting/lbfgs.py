@@ -47,7 +47,7 @@ def minimize(loss: Loss, start: Array, *, steps: int, least_change: float = 1e-1
     Args:
         loss: (d,) -> loss and gradient (d,), float64.
         start: (d,)
-        steps: at most; and at most twice as many evaluations.
+        steps: at most; none begins after twice as many evaluations.
         least_change: of the loss, relative to it or to 1 if that is larger, below which a step is the last.
     """
     size = len(start)
@@ -90,8 +90,10 @@ def minimize(loss: Loss, start: Array, *, steps: int, least_change: float = 1e-1
 
 
 def _line_search(loss: Loss, at: Array, along: Array, start: _Trial, first: float) -> tuple[_Trial, int]:
-    """A step that fulfils the strong Wolfe conditions, or the best that was tried; and how many were (Nocedal and
-    Wright 2006, algorithms 3.5 and 3.6)."""
+    """A step that fulfils the strong Wolfe conditions, or the best that was tried; and how many were.
+
+    Nocedal and Wright 2006, algorithms 3.5 and 3.6.
+    """
     low, high, step = start, None, first
     for tried in range(1, TRIALS + 1):
         value, gradient = loss(at + step * along)

@@ -31,7 +31,7 @@ def can_use_kernel(names: Sequence[str], module: nn.Module, *tensors: Tensor) ->
     """
     if not no_active_transforms():
         return False
-    parameters, dtype = private.held_parameters(module, names), tensors[0].dtype
+    parameters, dtype = private.held_tensors(module, names), tensors[0].dtype
     return dtype in (torch.float64, torch.float32) and all(is_plain(t, dtype) for t in (*tensors, *parameters))
 
 

@@ -47,7 +47,7 @@ def is_batch_of_gradients(tensor: Tensor) -> bool:
     return not torch._C._dispatch_keys(tensor).has(torch._C.DispatchKey.CPU)
 
 
-def held_parameters(module: nn.Module, names: Sequence[str]) -> list[Tensor | None]:
+def held_tensors(module: nn.Module, names: Sequence[str]) -> list[Tensor | None]:
     """Parameters or buffers of these names; None for one that torch.nn.utils.parametrize computes, as getattr would."""
     return [module._parameters.get(name, module._buffers.get(name)) for name in names]
 
@@ -78,10 +78,10 @@ def structure_of(module: nn.Module) -> list[object] | None:
         if part._forward_hooks or part._forward_pre_hooks or part._backward_hooks or part._backward_pre_hooks:
             return None
         found.append(own)
-        for name, value in part.__dict__.items():
+        for name, value in vars(part).items():
+            if callable(getattr(own, name, None)):
+                return None
             if name[0] != "_":
-                if callable(value) and callable(getattr(own, name, None)):
-                    return None
                 found.append(value if isinstance(value, KNOWN_BY_VALUE) else object())
     return found
 
