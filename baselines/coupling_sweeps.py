@@ -34,7 +34,7 @@ _S0, _S1, _S2, _S3, _S4, _S5, _S6, _S7, _S8, _S9, _S10 = ((-1) ** k / math.facto
 """Taylor's series on |r| <= π/2, to 1e-16."""
 
 
-_inlined = numba.njit(forceinline=True, **OPTIONS)
+_inlined: Any = numba.njit(forceinline=True, **OPTIONS)
 """For longer functions: of one that is called each kernel brings a copy of its own, rounded in its own way."""
 
 
@@ -60,7 +60,7 @@ def _sine(r: Any) -> Any:
     return r * ((((((high * z + _S5) * z + _S4) * z + _S3) * z + _S2) * z + _S1) * z + _S0)
 
 
-@_inlined
+@_inlined  # type: ignore[untyped-decorator]
 def _waves_one_by_one(
     W: Array, b: Array, count: int, part: int, state: Array, cosines: Array, sines: Array, begin: int, end: int
 ) -> None:
@@ -131,7 +131,7 @@ def room_for(dim: int, count: int) -> Any:
     return 2 * count + 2 * WIDTH + 2 * wide * (1 + wide)
 
 
-@_inlined
+@_inlined  # type: ignore[untyped-decorator]
 def _encode_one(W: Array, phases: Array, A: Array, state: Array, kept: Array, room: Array) -> None:
     """A normalised point ``state`` (n,) through all layers, in place; ``kept`` as the kernel's, or (0, 0)."""
     dim, (n_layers, _, count) = len(state), phases.shape
@@ -270,7 +270,7 @@ def speed_kernel() -> Any:
     return compiled(speed, signature)
 
 
-@_inlined
+@_inlined  # type: ignore[untyped-decorator]
 def _log_speed(network: Array, ends: Array, u: Array, room: Array) -> Any:
     """g(u) held within ``ends``: two layers of leaky ReLUs and a sum; ``network`` holds W (out, in) and b in turns."""
     dim = len(u)

@@ -545,12 +545,10 @@ class LatentDS(StableDS):
         psi, attractor = self.diffeomorphism, self.attractor
         sources = [attractor, self.start, *tensors_of(psi)]
         differentiated = torch.is_grad_enabled() and any(source.requires_grad for source in sources)
-        if (
-            differentiated
-            or attractor.is_meta
-            or not no_active_transforms()
-            or (structure := structure_of(psi)) is None
-        ):
+        if differentiated or attractor.is_meta or not no_active_transforms():
+            return None
+        structure = structure_of(psi)
+        if structure is None:
             return None
         return self._memo.of([psi, *structure], sources, self._new_frame)
 

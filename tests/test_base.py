@@ -283,6 +283,10 @@ def set_a_method(ds):
     ds.dynamics.forward = lambda x, y, frame: torch.ones_like(x)
 
 
+def set_a_private_method(ds):
+    ds._linearize = lambda y: (y, lambda tangent: -tangent, ds.frame())
+
+
 def move_the_attractor(ds):
     ds.attractor += 0.1
 
@@ -300,7 +304,8 @@ class Halved(torch.nn.Module):
         return strengths / 2
 
 
-CHANGES = [write_through_data, slow_the_law, replace_the_law, hook, set_a_method, move_the_attractor, parametrize]
+CHANGES = [write_through_data, slow_the_law, replace_the_law, hook, set_a_method, set_a_private_method]
+CHANGES += [move_the_attractor, parametrize]
 
 
 @pytest.mark.parametrize("change", [*CHANGES, not_a_number])

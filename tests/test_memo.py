@@ -65,3 +65,20 @@ def test_every_tensor_of_a_module_once():
     wanted = [*module.parameters(), *module.buffers()]
     assert {id(tensor) for tensor in tensors_of(module)} == {id(tensor) for tensor in wanted}
     assert len(tensors_of(module)) == len(wanted)
+
+
+def test_another_dtype_or_number_of_tensors_is_a_change():
+    one = torch.ones(2)
+    memo, count = Memo(), Counted([one])
+    memo.of(None, [one], count)
+    memo.of(None, [one.double()], count)  # equal in value
+    memo.of(None, [one.double(), one], count)
+    assert count.calls == 3
+
+
+def test_what_has_no_content_is_computed_every_time():
+    nowhere = torch.ones(2, device="meta")
+    memo, calls = Memo(), []
+    for _ in range(2):
+        memo.of(None, [nowhere], lambda: calls.append(1))
+    assert len(calls) == 2

@@ -315,3 +315,13 @@ def test_no_place_is_faster_than_what_was_shown_there(seed):
 def test_motions_that_never_move_on_still_make_a_law():
     law = pooled(np.full(100, 0.7), np.linspace(1, 0.9, 100))
     assert float(law.speeds.min()) > 0
+
+
+def test_a_law_is_of_its_dtype_whatever_it_was_before():
+    law = KnottedLaw(torch.tensor([0.25, 0.5]), torch.tensor([0.5, 1.0]))  # the same numbers in float32
+    for dtype in (torch.float64, torch.float32, torch.float64):
+        law.to(dtype)
+        assert law.speed(torch.full((3,), 0.3, dtype=dtype)).dtype == dtype
+    law.to("meta")
+    for _ in range(2):
+        assert law.speed(torch.zeros(3, device="meta", dtype=torch.float64)).is_meta

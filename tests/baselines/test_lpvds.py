@@ -93,3 +93,13 @@ def test_follows_a_winding_spiral():
 def test_bad_arguments_are_named(argument, value):
     with pytest.raises(ValueError, match=f"^{argument}: expected"):
         small(2, **{argument: value})
+
+
+def test_matrices_that_are_kept_are_those_of_the_parameters():
+    systems = LinearSystems(2)
+    u = torch.ones(3, 2, dtype=torch.float64)
+    for part in (systems.root, systems.turning, systems.damping):
+        part.data.add_(torch.arange(part.numel(), dtype=torch.float64).view_as(part) / 10 + 0.3)
+        with torch.no_grad():
+            kept = systems(u)
+        torch.testing.assert_close(kept, systems(u).detach())

@@ -294,3 +294,12 @@ def test_the_compiled_call_sees_every_change(fitted):
     torch.testing.assert_close(ds(y), after / 2)
     ds.dynamics.register_forward_hook(lambda module, given, result: 3 * result)
     torch.testing.assert_close(ds(y), 3 * after / 2)
+
+
+def test_a_map_that_is_replaced_leaves_no_tables(fitted):
+    ds, y = copy.deepcopy(fitted).requires_grad_(False), wavy_motion(3).start + 0.1
+    ds.diffeomorphism = copy.deepcopy(ds.diffeomorphism)  # the speed still reads the other one
+    assert ds.tables() is None
+    with reference():
+        wanted = ds(y)
+    torch.testing.assert_close(ds(y), wanted)
