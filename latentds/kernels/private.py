@@ -59,6 +59,8 @@ def tensors_of(module: nn.Module) -> list[Tensor]:
 
 
 KNOWN_BY_VALUE = (bool, int, float, str, type(None), nn.Module)
+OF_EVERY_MODULE = frozenset(vars(nn.Module()))
+"""What torch keeps in a module, of which none is a method's name; to ask each for it takes as long as all the rest."""
 
 
 def is_altered(module: nn.Module) -> bool:
@@ -77,8 +79,10 @@ def structure_of(module: nn.Module) -> list[object] | None:
         own = type(part)
         if part._forward_hooks or part._forward_pre_hooks or part._backward_hooks or part._backward_pre_hooks:
             return None
-        found.append(own)
+        found += own, part.training
         for name, value in vars(part).items():
+            if name in OF_EVERY_MODULE:
+                continue
             if callable(getattr(own, name, None)):
                 return None
             if name[0] != "_":
