@@ -119,6 +119,23 @@ class NeverArrives(Plain):
         return torch.cat([start, torch.where(first > 0.01, outside, start)[..., 1:, :]], dim=-2)
 
 
+class LeavesAgain(Plain):
+    """It is at the goal at every whole duration, and away from it between them."""
+
+    def rollout(self, y0, t):
+        away = 0.3 * torch.sin(np.pi * torch.as_tensor(t) / wavy_motion(self.dim).duration) ** 2
+        return super().rollout(y0, t) + away.unsqueeze(-1)
+
+
+class TurnsRound(Plain):
+    """Twice on its way it turns round."""
+
+    def rollout(self, y0, t):
+        t = torch.as_tensor(t)
+        farther = 1 + 3 * torch.sin(3 * (t - t[0])) ** 2
+        return self.attractor + farther.unsqueeze(-1) * (super().rollout(y0, t) - self.attractor)
+
+
 class RollsOutFaster(Plain):
     def rollout(self, y0, t):
         return super().rollout(y0, 1.01 * torch.as_tensor(t))
@@ -415,6 +432,8 @@ BROKEN = {
     MovesAtTheAttractor: "check_equilibrium: at the attractor",
     HasNegativeV: "check_descent: V = ",
     NeverArrives: "check_convergence: still",
+    LeavesAgain: "check_convergence: still",
+    TurnsRound: "check_fall: V rises",
     RollsOutFaster: "check_flow: off the integral",
     HasNoVelocitySomewhere: "check_flow: not finite",
     BeginsElsewhere: "check_times: begin at y0",
