@@ -22,6 +22,9 @@ FADING = -math.log(0.01)
 """α_x: the phase variable x = exp(-α_x s) has come down to a hundredth when the demonstration ends."""
 SPRING_HORIZON = 3.0
 """Durations after which the force, by then a millionth of what it was, is over."""
+REST = 1.0
+"""Durations of rest at the goal that are appended to each demonstration: without them nothing says where the weights of
+the last ψ_i, which go on pushing, lead after its end."""
 GRID = 1e-3
 """Durations between two entries of the tables of responses."""
 RIDGE_WEIGHT = 1e-6
@@ -37,8 +40,9 @@ class DMP(PhaseDriven):
     neighbouring centers, which are even in time. The motion begins with the demonstrated velocity.
 
     Position is linear in the weights w, so these are the least squares of the positions themselves, of all
-    demonstrations, with a ridge of 1e-6, instead of those of forces that are read from second differences; and a
-    rollout is a sum of the responses to every ψ_i, which are tabulated once, instead of an integration.
+    demonstrations, each followed by a duration of rest at its goal, with a ridge of 1e-6, instead of those of forces
+    that are read from second differences; and a rollout is a sum of the responses to every ψ_i, which are tabulated
+    once, instead of an integration.
 
     ``fit_report.mse`` is of the positions from the demonstrated starts, per coordinate; ``n_layers`` is the number of
     basis functions. Several demonstrations are pooled; the ends and the duration are their means.
@@ -68,10 +72,13 @@ class DMP(PhaseDriven):
         fresh._place(shown)
         with torch.no_grad():
             fresh.departure.copy_(torch.stack([d.velocities[0] * d.duration for d in shown]).mean(0))
-            phases = [d.times / d.duration for d in shown]
+            phases = [torch.arange(round((1 + REST) * (len(d) - 1)) + 1).double() / (len(d) - 1) for d in shown]
             bent = torch.cat([fresh._response(s)[0] for s in phases])
             unbent = [fresh.motion(d.start, 0.0, s) for d, s in zip(shown, phases, strict=True)]
-            wanted = torch.cat([d.positions for d in shown]) - torch.cat(unbent)
+            rested = [
+                d.positions[torch.arange(len(s)).clamp(max=len(d) - 1)] for d, s in zip(shown, phases, strict=True)
+            ]
+            wanted = torch.cat(rested) - torch.cat(unbent)
             lengths = torch.linalg.vector_norm(bent, dim=0)
             bent = torch.cat([bent / lengths, math.sqrt(RIDGE_WEIGHT) * torch.eye(self.n_basis, dtype=torch.float64)])
             wanted = torch.cat([wanted, wanted.new_zeros(self.n_basis, self.dim)])

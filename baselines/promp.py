@@ -46,7 +46,7 @@ class ProMP(PhaseDriven):
 
     doubt: Tensor
 
-    def __init__(self, dim: int, *, n_basis: int = 50) -> None:
+    def __init__(self, dim: int, *, n_basis: int = 20) -> None:
         super().__init__(dim)
         self.n_basis = whole_number(n_basis, "n_basis", at_least=3)
         straight = torch.linspace(1, 0, self.n_basis, dtype=torch.float64)
