@@ -15,13 +15,18 @@ from .training import Training, descend_smoothly
 DESCENT_RATE = 1.0
 """α: V falls at least by α V a duration, so that whatever the regression says a motion is within a hundredth of its way
 after ten."""
-FADING_RADIUS = 0.02
-"""Sizes around the goal within which the regression, which is not 0 there, is led to 0."""
+ARRIVING_RADIUS = 0.05
+"""Sizes around the goal within which the regression, which is not 0 there, is led to one that moves to the goal."""
+ARRIVING_RATE = 10.0
+"""Of that one, -10 z, which falls by e in a tenth of the duration: led to 0, a motion would crawl on V's slope."""
 SPEED_CAP = 2.0
 """Times the largest demonstrated speed that f approaches where its linear maps, far from where they were learned, would
 be faster; what was shown it changes by less than a thousandth."""
 MIN_EIGENVALUE = 1e-2
 """Least eigenvalue of the quadratic part of V, whose others are about 1."""
+GROWTH_WEIGHT = 1e-6
+"""Weight of the squared change of V's parameters: directions do not tell how steep V is, and where it grows without
+bound its valleys are so narrow that no motion along them can be integrated."""
 DESCENT_WEIGHT = 1e-4
 """Weight of descending steeply beside that of not rising, as in the authors' code."""
 
@@ -33,7 +38,7 @@ class CLFDM(NormalizedDS):
     alone; f is Gaussian mixture regression of the velocities; and u = -∇V max(0, ∇V·f + ρ)/‖∇V‖², the least that gives
     V̇ <= -ρ. Where the demonstrations descend V, f is left as it is. Four things are our own: all matrices are positive
     by parametrisation, so that L-BFGS learns V without constraints; the margin is ρ = α V, which grows without bound
-    and makes V fall exponentially; and f fades to 0 at the goal within ``FADING_RADIUS`` sizes of it, without which
+    and makes V fall exponentially; and f becomes -10 z within ``ARRIVING_RADIUS`` sizes of the goal, without which
     the field would jump there, and grows no faster than ``SPEED_CAP`` demonstrated speeds.
 
     Learns from one demonstration or from several, pooled; their goals' mean is the attractor. ``fit_report.mse`` is the
@@ -77,7 +82,7 @@ class CLFDM(NormalizedDS):
         regression = fit_regression(pool, self.n_components, drawn_seed(self.seed))
         learner.regression.load_state_dict(regression.state_dict())
         speeds, distances = (torch.linalg.vector_norm(part, dim=-1) for part in (pool.velocities, pool.points))
-        moving = (speeds > 1e-3 * speeds.max()) & (distances > FADING_RADIUS)
+        moving = (speeds > 1e-3 * speeds.max()) & (distances > ARRIVING_RADIUS)
         points, headings = pool.points[moving], pool.velocities[moving] / speeds[moving, None]
         energy.begin(points)
 
@@ -86,9 +91,12 @@ class CLFDM(NormalizedDS):
             cosines: Tensor = (slopes * headings).sum(-1) / torch.linalg.vector_norm(slopes, dim=-1)
             return cosines
 
+        begun = {part: part.detach().clone() for part in energy.parameters()}
+
         def loss() -> Tensor:
             rise = rises()
-            return torch.where(rise > 0, rise.square(), -DESCENT_WEIGHT * rise.square()).mean()
+            grown = torch.stack([(part - before).square().sum() for part, before in begun.items()]).sum()
+            return torch.where(rise > 0, rise.square(), -DESCENT_WEIGHT * rise.square()).mean() + GROWTH_WEIGHT * grown
 
         history = descend_smoothly(loss, dict.fromkeys(energy.parameters(), 1.0), self.iterations)
         with torch.no_grad():
@@ -103,8 +111,8 @@ class CLFDM(NormalizedDS):
         return energy.to(wanted)
 
     def normalized_velocity(self, u: Tensor) -> Tensor:
-        fading = -torch.expm1(-u.square().sum(-1, keepdim=True) / (2 * FADING_RADIUS**2))
-        wish = fading * self.regression(u, nearby(u))
+        away = -torch.expm1(-u.square().sum(-1, keepdim=True) / (2 * ARRIVING_RADIUS**2))
+        wish = torch.lerp(-ARRIVING_RATE * u, self.regression(u, nearby(u)), away)
         speed = torch.linalg.vector_norm(wish, dim=-1, keepdim=True)
         wish = wish / (1 + (speed / (SPEED_CAP * self.pace)) ** 8) ** 0.125
         energy, slope = self.energy.with_gradient(u)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from baselines import CLFDM
-from baselines.clfdm import DESCENT_RATE, FADING_RADIUS, AsymmetricQuadratics
+from baselines.clfdm import ARRIVING_RADIUS, DESCENT_RATE, AsymmetricQuadratics
 from latentds import Demonstration
 from latentds.testing import parametrize_stable_ds, wavy_motion
 
@@ -62,7 +62,7 @@ def test_v_falls_at_its_rate_from_everywhere(draw):
 def test_the_correction_is_the_least_that_does():
     ds = CLFDM(2, n_components=3, iterations=30, seed=0).fit(wavy_motion(2))
     grid = torch.cartesian_prod(*[torch.linspace(-1, 1, 21, dtype=torch.float64)] * 2)
-    z = grid[grid.norm(dim=-1) > 10 * FADING_RADIUS]
+    z = grid[grid.norm(dim=-1) > 10 * ARRIVING_RADIUS]
     slope, energy = ds.energy.gradient(z), ds.energy(z)
     wish = ds.regression(z)
     speed = wish.norm(dim=-1, keepdim=True)
