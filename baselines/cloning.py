@@ -6,7 +6,7 @@ from torch import Tensor
 
 from latentds.arguments import whole_number
 
-from .networks import VelocityRegression, perceptron, seeded_generator
+from .networks import EPOCHS, VelocityRegression, perceptron, seeded_generator
 
 
 class BehaviourCloning(VelocityRegression):
@@ -25,7 +25,9 @@ class BehaviourCloning(VelocityRegression):
         epochs: passes over the samples, >= 1.
     """
 
-    def __init__(self, dim: int, *, n_units: int = 128, seed: int | None = None, epochs: int = 1000) -> None:
+    weight_decay = 1e-4
+
+    def __init__(self, dim: int, *, n_units: int = 128, seed: int | None = None, epochs: int = EPOCHS) -> None:
         super().__init__(dim, seed=seed, epochs=epochs)
         self.n_units = whole_number(n_units, "n_units", at_least=1)
         sizes = [self.dim, *[self.n_units] * 3, self.dim]

@@ -12,7 +12,7 @@ from torch.nn.functional import softplus
 from latentds.arguments import number_in, whole_number
 
 from .couplings import no_autocast
-from .networks import VelocityRegression, linear, perceptron, seeded_generator
+from .networks import EPOCHS, VelocityRegression, linear, perceptron, seeded_generator
 
 QUADRATIC_WEIGHT = 1e-2
 """ε, weight of ‖u‖² in V, which makes it positive and unbounded whatever was learned."""
@@ -47,9 +47,9 @@ class NeuralLyapunov(VelocityRegression):
         *,
         n_units: int = 128,
         n_convex: int = 64,
-        alpha: float = 0.1,
+        alpha: float = 1.0,
         seed: int | None = None,
-        epochs: int = 1000,
+        epochs: int = EPOCHS,
     ) -> None:
         super().__init__(dim, seed=seed, epochs=epochs)
         self.n_units = whole_number(n_units, "n_units", at_least=1)
