@@ -1,9 +1,9 @@
-"""Neural contractive dynamics: any two motions come nearer to each other at a certified rate."""
+"""Contracting, after NCDS and ELCD: any two motions come nearer to each other at a certified rate."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -13,23 +13,27 @@ from latentds.dynamics import Frame
 from latentds.integrate import integrate
 
 from .couplings import AffineCouplings, no_autocast
-from .flows import FlowDS, FlowDynamics, Normalized, descend_bending, ray_loss
+from .flows import FlowDS, FlowDynamics, Normalized, descend_bending, velocity_loss
 from .networks import seeded_generator
 from .training import Plan, Training
 
 
 class NCDS(FlowDS):
-    """ẋ has the Jacobian -(JᵀJ + εI) + S in the space of a learned flow (after Beik-Mohammadi et al. 2024).
+    """Contracting, after NCDS and ELCD: ẋ has the Jacobian -(JᵀJ + εI) + S in the space of a learned flow.
 
     φ = ψ⁻¹ is a chain of affine couplings and the latent field :class:`ContractingDynamics`; both are learned together
     from velocities, of one demonstration or of several, pooled; their goals' mean is the attractor. Contraction does
     not depend on coordinates, so motions approach each other at least at the rate ε in the metric of J_φᵀJ_φ.
 
-    Where this differs from the paper, and why. There J is a deep network of x, and ẋ is -(JᵀJ + εI) integrated along a
-    line. Such an integral depends on the line unless the rows of JᵀJ are gradients, and then -(JᵀJ + εI) is not the
-    Jacobian of ẋ: what is certified is that motions approach the line's first point, not each other. J of one layer
-    has such rows: the integral is in closed form, the same along every line, and contraction is certified. What it can
-    say less, the flow says, as the flow of the paper's autoencoder does; the skew S is from Jaffe et al. (2024).
+    Where this differs from NCDS (Beik-Mohammadi et al. 2024), and why: it is not the network of that paper. There J is
+    a deep network of x, and ẋ is -(JᵀJ + εI) integrated along a line. Such an integral depends on the line unless the
+    rows of JᵀJ are gradients, and then -(JᵀJ + εI) is not the Jacobian of ẋ: what is certified is that motions approach
+    the line's first point, not each other. J of one layer has such rows: the integral is in closed form, the same along
+    every line, and contraction is certified. What it says less, the flow says, as the flow of the paper's autoencoder
+    does; the skew S is from ELCD (Jaffe et al. 2024).
+
+    The loss is that of the velocities alone; in three dimensions and more the demonstration is bent from its chord in
+    steps, without which a winding one is not learned.
 
     ``fit_report.mse`` is the mean over all N n entries of the squared velocity error, (units / second)².
 
@@ -73,9 +77,7 @@ class NCDS(FlowDS):
         def pull(u: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
             return self.dynamics.pull(z), torch.ones_like(z[:, :1])
 
-        def loss_of(bent: Normalized) -> Callable[[Tensor], Tensor]:
-            return ray_loss(self.diffeomorphism, pull, bent)
-
+        loss_of = partial(velocity_loss, self.diffeomorphism, pull)
         return descend_bending(self, loss_of, data, plan, generator, progress)
 
 

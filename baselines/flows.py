@@ -179,17 +179,40 @@ def descend_bending(
     return Training(tuple(history), tuple(notes))
 
 
-def ray_loss(
-    psi: AffineCouplings, field: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], data: Normalized
-) -> Callable[[Tensor], Tensor]:
+Field = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""u and z = φ(u) - φ(goal), (b, n) each -> a latent velocity, (b, n), and a factor, (b, 1), that v̂ = J_φ⁻¹ (…) has."""
+
+
+def velocity_loss(psi: AffineCouplings, field: Field, data: Normalized) -> Callable[[Tensor], Tensor]:
+    """SmoothL1 error of the velocities, as SDS-EF's authors take it: the mean over points and coordinates.
+
+    Args:
+        psi: φ⁻¹.
+        field: the latent dynamics.
+        data: the demonstrations.
+    """
+    points, velocities, goal = (part.to(psi.center) for part in (data.points, data.velocities, data.goal))
+    linearize = quickest_linearize(psi)
+
+    def loss(batch: Tensor) -> Tensor:
+        u = points[batch]
+        x, push = linearize(torch.cat([u, goal.unsqueeze(0)]))
+        latent, factor = field(u, x[:-1] - x[-1])
+        flow = push(torch.cat([latent, torch.zeros_like(goal).unsqueeze(0)]))[:-1]
+        return nn.functional.smooth_l1_loss(factor * flow, velocities[batch])
+
+    return loss
+
+
+def ray_loss(psi: AffineCouplings, field: Field, data: Normalized) -> Callable[[Tensor], Tensor]:
     """2 mean(√(1 + ‖v̂-v‖²/‖v‖²) - 1) + mean(√(1 + ‖J_φ⁻¹ d / 0.05‖²) - 1) + mean ‖z/‖z‖ - e‖².
 
     e is the direction of z at the demonstrated start and d = z - max(0, z·e) e the way off the ray along it. The goals
     themselves have no direction and are left out.
 
     Args:
-        psi: φ⁻¹, of which z = φ(u) - φ(goal).
-        field: u and z, (b, n) each -> a latent velocity, (b, n), and a factor, (b, 1), which v̂ = J_φ⁻¹ (…) has, too.
+        psi: φ⁻¹.
+        field: the latent dynamics.
         data: the demonstrations.
     """
     points, velocities, starts, goal = (
