@@ -9,8 +9,9 @@ import torch
 
 from ..arguments import Array, number_in, whole_number
 from ..base import LatentDS, Learned
-from ..demonstration import Demonstration, goal_apart, only_one
+from ..demonstration import Demonstration, goal_apart
 from ..dynamics import RayDynamics
+from ..fitting.average import mean_motion
 from ..fitting.homotopy import linear_homotopy
 from ..fitting.matching import PINS, match_along, pin_ends
 from ..fitting.refinement import refine
@@ -26,6 +27,7 @@ class GreedyDS(LatentDS):
     """ψ maps a latent line onto one demonstration by greedy locally weighted translations (Perrin 2016, Alg. 1).
 
     The latent point moves straight to the goal. A subclass says where the latent points lie and how fast one moves.
+    Given several demonstrations, it learns their mean at equal progress, with the mean of their goals, and notes that.
 
     Args:
         dim: n >= 1.
@@ -79,7 +81,10 @@ class GreedyDS(LatentDS):
         """How fast the latent point moves, for a demonstration of so many seconds."""
 
     def _learn(self, shown: Sequence[Demonstration], progress: bool) -> Learned:
-        motion = only_one(shown, type(self).__name__)
+        motion, *_ = mean_motion(shown)
+        averaged = (
+            (f"learned the mean of {len(shown)} demonstrations, as it learns from one",) if len(shown) > 1 else ()
+        )
         goal_apart(motion, motion.goal)
         psi, points, latent = self.diffeomorphism, motion.positions.numpy(), self.latent_line(motion)
         n_layers, beta, mu, notes = self._hyperparameters(latent, points)
@@ -95,7 +100,7 @@ class GreedyDS(LatentDS):
             self.start.copy_(motion.start)
             missed = psi(torch.from_numpy(latent).to(self.attractor)) - motion.positions.to(self.attractor)
         self._refuse_folds(motion)
-        return Learned(float(missed.square().mean()), psi.n_layers, notes=notes)
+        return Learned(float(missed.square().mean()), psi.n_layers, notes=(*averaged, *notes))
 
     def _hyperparameters(self, latent: Array, points: Array) -> tuple[int, float, float, tuple[str, ...]]:
         """M, β and μ, and a note of those that were not given."""

@@ -5,22 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ..arguments import Array, number_in
 from ..base import FitReport, LatentDS, Learned
-from ..curves import interpolated, step_lengths
+from ..curves import step_lengths
 from ..demonstration import Demonstration, goal_apart
 from ..dynamics import TubeDynamics
-from ..fitting.embedding import arc_length_path
+from ..fitting.average import DECIMALS, mean_motion
 from ..fitting.search import PLAN, Search, Several, refuse_crossings
 from ..time_law import KnottedLaw
 from ..translations import Layers, LocallyWeightedTranslations
 
-DECIMALS = 9
-"""To which the motion is rounded, in its own sizes."""
 TUBE_RADIUS = 0.02
 """Of the tube that the report speaks of, in lengths of the latent line."""
 WILD_CONDITION = 1000.0
@@ -185,27 +182,3 @@ class TubeDS(LatentDS):
             "largest_velocity": float(torch.linalg.vector_norm(self(y), dim=-1).max()) * shown.duration / length,
             "largest_gradient": float(torch.linalg.matrix_norm(slopes, 2).max()) * shown.duration,
         }
-
-
-def mean_motion(shown: Sequence[Demonstration]) -> tuple[Demonstration, Array, Array]:
-    """The mean of several demonstrations at equal progress, with the mean goal; each at even progress; and when.
-
-    Each, (K, N, n), is moved onto the common goal, the more the farther along it is; its times are (K, N), in seconds.
-    """
-    goal = np.mean([one.goal.numpy() for one in shown], axis=0)
-    paths, arrivals, even = [], [], np.linspace(0, 1, PLAN.n_points)
-    for one in shown:
-        path, way, times = arc_length_path(one.positions.numpy(), one.times.numpy(), PLAN.n_points)
-        paths.append(path + even[:, None] * (goal - path[-1]))
-        arrivals.append(one.duration * (np.interp(even, 1 - way, times) / one.duration).round(DECIMALS))
-    strands = np.stack(paths)
-    if len(shown) == 1:
-        return shown[0], strands, np.stack(arrivals)
-    count, arrival = max(len(one) for one in shown), np.mean(arrivals, axis=0)
-    at = np.interp(np.linspace(0, arrival[-1], count), arrival, even)
-    mean = interpolated(at, even, strands.mean(0))
-    return (
-        Demonstration(torch.from_numpy(mean), arrival[-1] / (count - 1), f"mean of {len(shown)}"),
-        strands,
-        np.stack(arrivals),
-    )

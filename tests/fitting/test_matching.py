@@ -183,7 +183,6 @@ def test_bad_demonstrations(method):
         "expected dimension 3, got 2": wavy_motion(2),
         "expected a goal apart from the start, got a closed loop": Demonstration(loop, 0.1),
         "got list \\(empty\\)": [],
-        "learns from exactly one, got 2": [shown, shown],
         "expected a Demonstration or a non-empty list of them, got Tensor": shown.positions,
         "expected a Demonstration or a non-empty list of them, got NoneType": None,
         "expected a Demonstration or a non-empty list of them, got list": [shown, 3],
@@ -262,3 +261,16 @@ def test_no_depth_asked_for_is_the_papers_rule(method):
     assert torch.equal(fresh(shown.positions), ds(shown.positions))
     with pytest.raises(ValueError, match="n_layers: expected a number beside beta"):
         method(3, n_layers=None, beta=0.7)
+
+
+@pytest.mark.parametrize("method", TABLE_I, ids=lambda method: method.__name__)
+def test_of_several_the_mean_is_learned_and_that_is_said(method):
+    shown, shift = wavy_motion(3), torch.tensor([0.0, 0.1, 0.0], dtype=torch.float64)
+    way = torch.linspace(1, 0, len(shown), dtype=torch.float64).unsqueeze(-1)
+    apart = [Demonstration(shown.positions + sign * way * shift, shown.dt) for sign in (-1, 1)]
+    ds = method(3, n_layers=150).fit(apart)
+    assert "learned the mean of 2 demonstrations, as it learns from one" in ds.fit_report.notes
+    with torch.no_grad():
+        missed = (ds.rollout(shown.start, shown.times) - shown.positions).norm(dim=-1)
+    assert float(missed.max()) < 0.05 * shown.size
+    assert torch.equal(ds.attractor, shown.goal)

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from latentds import Demonstration, datasets
-from latentds.methods.tube import TubeDS, mean_motion
+from latentds.fitting.average import mean_motion
+from latentds.methods.tube import TubeDS
 from latentds.metrics import dtw
 from latentds.testing import wavy_motion
 from tests.motions import creep_then_dash, motion, pause, planar_spiral, rest_at_both_ends, rest_first, tensor
