@@ -36,11 +36,9 @@ from latentds.base import LatentDS
 from latentds.benchmark import Cell, Factory, Paths, RolloutProtocol, run, table
 from latentds.fitting.matching import PINS
 
-PROTOCOL = RolloutProtocol()
-MORE_STARTS = RolloutProtocol(n_starts=200)
+PROTOCOL = RolloutProtocol(radius=0.1)
+MORE_STARTS = RolloutProtocol(n_starts=200, radius=0.1)
 """On each spiral for TubeDS alone: over 20 starts a mean is still a matter of chance."""
-BALL_RADIUS = 0.05
-"""Radius of the ball of starts around a recording's start, in sizes of the motion; 0.1 on the spirals' sphere."""
 KAPPAS = (0.5, 5.0, 80.0)
 """Beside the default, 20; the first is as good as none. Refinement moves the scores of off-path starts little."""
 TRIED_EVERYWHERE = (
@@ -107,7 +105,7 @@ def parts(
     layers = [(label, d) for d in shown for label in GREEDY if d.name in TABLE_ONE[label]]
     yield Part(HALF_LAYERS, PROTOCOL, [cell(label, half_the_layers(label, d.name), d) for label, d in layers])
     for d in recorded:
-        near = RolloutProtocol(n_starts=6, radius=BALL_RADIUS * d.size)
+        near = RolloutProtocol(n_starts=6)
         yield Part("recordings", near, [cell(label, variants(d.name)[label], d) for label in TRIED_EVERYWHERE])
     # Each is shown the first and judged by all, or shown six and judged by the seventh, from where those start.
     theirs, seven = RolloutProtocol(n_starts=0), written.items()

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import joblib
 import typer
 
 from baselines import FDM, SDSEF
@@ -86,3 +88,17 @@ def recordings(paths: Sequence[Path]) -> list[Demonstration]:
     if repeated := [name for name, count in Counter(d.name for d in recorded).items() if count > 1]:
         raise typer.BadParameter(f"data: expected recordings of different names, got {repeated[0]!r} again")
     return recorded
+
+
+@contextmanager
+def cluster(address: str | None) -> Iterator[None]:
+    """Joblib's work goes to the Dask cluster whose scheduler listens there; None: stays here."""
+    if address is None:
+        yield
+        return
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ImportError("--dask needs distributed: pip install 'latentds[distributed]'") from error
+    with Client(address), joblib.parallel_config(backend="dask"):
+        yield

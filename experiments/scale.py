@@ -26,8 +26,8 @@ import torch
 
 from baselines import SDSEF
 from experiments import report
+from experiments.compared import cluster
 from experiments.report import Goal, at_most
-from experiments.spirals import cluster
 from latentds import ChebyshevDS, StableDS, TubeDS, datasets, kernels
 from latentds.arguments import Array
 from latentds.benchmark import Cell, RolloutProtocol, run

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
-import joblib
 import numpy as np
 import pandas as pd
 import typer
@@ -24,7 +22,7 @@ from rich.console import Console
 from rich.markdown import Markdown
 
 from experiments import report
-from experiments.compared import RIVALS, methods, spirals
+from experiments.compared import RIVALS, cluster, methods, spirals
 from experiments.published import TABLE_ONE
 from latentds import Demonstration, plotting
 from latentds import report as page
@@ -56,7 +54,7 @@ def main(
     out.mkdir(parents=True, exist_ok=True)
     try:
         with cluster(dask):
-            for outcome in run(cells, n_jobs=jobs, progress=True, store=out / "cells.sqlite"):
+            for outcome in run(cells, PROTOCOL, n_jobs=jobs, progress=True, store=out / "cells.sqlite"):
                 done.append(outcome)
     except KeyboardInterrupt:
         console.print(f"Interrupted: {len(done)} of {len(cells)} cells are done; the same command goes on from here.")
@@ -67,7 +65,7 @@ def main(
         seconds = time.perf_counter() - began
         settings = {
             "command": {"quick": quick, "jobs": jobs, "seeds": seeds, "seconds": round(seconds, 1)},
-            "protocol": asdict(RolloutProtocol()),
+            "protocol": asdict(PROTOCOL),
             "methods": {d.name: {m: f(d.dim).settings for m, f in methods(d.name, quick).items()} for d in shown},
         }
         summary = summarize(rows, [d.name for d in shown], list(methods(shown[0].name, quick)))
@@ -80,20 +78,6 @@ def main(
         console.print(f"{out}: report.html, rows.csv, summary.md, settings.json and pictures, after {seconds:.0f} s")
     if len(done) < len(cells):
         raise typer.Exit(130)
-
-
-@contextmanager
-def cluster(address: str | None) -> Iterator[None]:
-    """Joblib's work goes to the Dask cluster whose scheduler listens there; None: stays here."""
-    if address is None:
-        yield
-        return
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise ImportError("--dask needs distributed: pip install 'latentds[distributed]'") from error
-    with Client(address), joblib.parallel_config(backend="dask"):
-        yield
 
 
 def summarize(rows: pd.DataFrame, names: list[str], labels: list[str]) -> str:
@@ -116,6 +100,7 @@ def summarize(rows: pd.DataFrame, names: list[str], labels: list[str]) -> str:
     return "# Ten spirals\n\n" + "\n\n".join(parts) + "\n"
 
 
+PROTOCOL = RolloutProtocol(radius=0.1)
 NOTES = f"""Raw sums of Euclidean distances over 500 points; lower is better, **bold** the best. †: FastDTW differs from
 exact DTW by more than 5 %. p: {RIVALS[0]} against {RIVALS[1]} on the shared starts, paired t-test and Welch's."""
 

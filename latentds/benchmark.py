@@ -32,7 +32,7 @@ def compare(
     *,
     judged_by: Demonstration | Sequence[Demonstration | Sequence[Demonstration]] | None = None,
     n_starts: int = 20,
-    radius: float = 0.1,
+    radius: float | None = None,
     seeds: Sequence[int] = (0,),
     n_points: int = 500,
     n_jobs: int | None = None,
@@ -54,7 +54,8 @@ def compare(
         n_starts: >= 0 perturbed starts beside the demonstrated one, which is start 0. With several judges each has its
             own 1 + n_starts, one after the other.
         radius: >= 0, in the units of the positions; the perturbed starts lie uniformly in a ball of this radius around
-            the demonstrated one. They are the same for every method and seed, their offsets for every demonstration.
+            the demonstrated one, by default a twentieth of the demonstration's size. They are the same for every method
+            and seed, and their offsets, for a given radius, for every demonstration.
         seeds: whole numbers >= 0, all different; each makes a cell of its own.
         n_points: >= 2 points per rollout, uniform in time over the demonstration's duration.
         n_jobs: processes, as joblib counts them. None: what ``joblib.parallel_config`` says around the call (that is
@@ -85,7 +86,8 @@ def compare(
         * ``velocity_rmse``, ``velocity_cosine``: the learned field against the demonstrated velocities at the
           demonstrated points, one number per judge.
         * ``mse``: the fit's own. This and all below are one number per cell.
-        * ``n_parameters``, ``n_layers``, ``fit_seconds``, ``rollout_seconds`` (of all starts together).
+        * ``n_parameters``, ``n_layers``, ``fit_seconds`` (of learning, without the library's own measuring of what was
+          learned), ``rollout_seconds`` (of all starts together).
 
     Raises:
         ValueError: if an argument is out of range or a method cannot be made, before any work.

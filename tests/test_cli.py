@@ -237,7 +237,7 @@ def test_compare_tells_writes_rows_and_a_page(folder):
     page = (folder / "all.html").read_text()
     assert "q_knee" in page
     assert "n_layers 30" in page
-    assert f"radius {0.05 * min(one.size for one in shown):.6g}" in page
+    assert "radius 5% of the size of each motion" in page
     assert said.splitlines()[-2:] == ["wrote all.csv", "wrote all.html"]
 
 

@@ -26,7 +26,7 @@ from typer.core import TyperGroup
 
 from .. import benchmark, findings, recordings
 from ..base import FitReport, StableDS
-from ..cell import Cell, Factory, RolloutProtocol, interrupts_kept, judge
+from ..cell import STARTS_WITHIN, Cell, Factory, RolloutProtocol, interrupts_kept, judge
 from ..certificate import certify as certified
 from ..datasets import joint_motion
 from ..demonstration import Demonstration
@@ -43,8 +43,6 @@ HTML = (".html", ".htm")
 NOT_FITTED = "source: expected a system that keeps its demonstration, got one that was not fitted"
 DOUBTFUL = 3
 """The exit status of what was done and should be looked at: 1 is an error, 2 one of usage."""
-RADIUS = 0.05
-"""Of the ball of perturbed starts, in sizes of the motion: the 0.1 of the paper, whose spirals are 2 wide."""
 
 
 class Group(TyperGroup):
@@ -252,7 +250,7 @@ def plot(
     ds, shown = given.system_of(source, options, method)
     if not shown:
         raise ValueError(NOT_FITTED)
-    protocol = RolloutProtocol(starts, RADIUS * shown[0].size if radius is None else radius)
+    protocol = RolloutProtocol(starts, radius)
     begin = torch.cat([protocol.starts(shown[0]), *(d.start.unsqueeze(0) for d in shown[1:])])
     with torch.no_grad(), interrupts_kept():
         paths = ds.rollout(begin.to(ds.attractor), protocol.times(shown[0])).double().numpy()
@@ -372,7 +370,7 @@ def report(
         ds, shown = given.loaded(source[0], *(method or ()))
         if not shown:
             raise ValueError(NOT_FITTED)
-        cell, protocol = Cell(type(ds).__name__, type(ds), shown, measure=findings), protocol_of(shown, starts, radius)
+        cell, protocol = Cell(type(ds).__name__, type(ds), shown, measure=findings), RolloutProtocol(starts, radius)
         paths: benchmark.Paths = {}
         rows = benchmark.table([cell], [judge(ds.double(), cell, protocol)], paths)
         settings = settings_of(protocol, {cell.method: ds})
@@ -395,7 +393,7 @@ def compared(
     from ..report import findings
 
     every = [one for item in motions for one in (item if isinstance(item, list) else [item])]
-    protocol, seeds = protocol_of(every, starts, radius), seeds or [0]
+    protocol, seeds = RolloutProtocol(starts, radius), seeds or [0]
     paths: benchmark.Paths = {}
     jobs = 1 if len(methods) * len(motions) * len(seeds) == 1 else jobs
     how = {**asdict(protocol), "seeds": seeds, "n_jobs": jobs, "progress": True}
@@ -403,14 +401,13 @@ def compared(
     return rows, paths, settings_of(protocol, {label: make(every[0].dim) for label, make in methods.items()})
 
 
-def protocol_of(shown: Sequence[Demonstration], starts: int, radius: float | None) -> RolloutProtocol:
-    return RolloutProtocol(starts, RADIUS * min(one.size for one in shown) if radius is None else radius)
-
-
 def settings_of(protocol: RolloutProtocol, systems: Mapping[str, StableDS]) -> dict[str, Any]:
     command = " ".join(["latentds", *map(shlex.quote, sys.argv[1:])])
     methods = {label: ds.settings for label, ds in systems.items()}
-    return {"command": command, "protocol": asdict(protocol), "methods": methods}
+    how = asdict(protocol)
+    if protocol.radius is None:
+        how["radius"] = f"{STARTS_WITHIN:.0%} of the size of each motion"
+    return {"command": command, "protocol": how, "methods": methods}
 
 
 def tell_rows(rows: pd.DataFrame, shown: Sequence[Any]) -> None:
