@@ -53,3 +53,22 @@ TABLE_TWO = {
 
 TABLE_THREE = {"a": 25.92, "b": 19.28, "c": 81.25, "d": 9.52, "e": 9.74, "f": 18.31}
 """Its Table III: FastDTW of six guided motions of a 7-joint arm."""
+
+
+class HeldOut(NamedTuple):
+    """Of protocol C, over the 26 shapes: what another's figures say, as they say it."""
+
+    method: str
+    rmse: str
+    e: str
+    dtwd: str
+
+
+# Stored with the code of Figueroa and Billard, "A Physically-Consistent Bayesian Non-Parametric Mixture Model for
+# Dynamical System Learning" (2018): github.com/nbfigueroa/ds-opt.
+
+HELD_OUT_HANDWRITING = (
+    HeldOut("SEDS (seds_stats_all.mat)", "6.34 ± 3.2", "0.099", "3954 (median 2130)"),
+    HeldOut("LPV-DS, PC-GMM, O2 (stats_all_test.fig)", "5.19", "0.062", "1749"),
+    HeldOut("LPV-DS, PC-GMM, O3 (stats_all_test.fig)", "5.28", "0.063", "—"),
+)

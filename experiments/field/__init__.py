@@ -1,1 +1,1 @@
-"""Every method under one protocol: ``python -m experiments.field``."""
+"""Every method of the field under the same protocols: ``python -m experiments.field``."""

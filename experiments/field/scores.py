@@ -1,67 +1,154 @@
-"""The field's own ways to show handwriting and to judge what was learned, each as a cell of a comparison."""
+"""What a method is scored by: each figure is defined once, here, in the docstring of its function.
+
+Distances are exact DTW over ``N_POINTS`` even times of the demonstration that judges, over their number, in sizes of
+that demonstration, unless a docstring says otherwise.
+"""
 
 from __future__ import annotations
 
+import json
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from latentds import Demonstration, StableDS, metrics
-from latentds.arguments import whole_number
-from latentds.benchmark import Cell, Factory
-from latentds.fidelity import largest_speed
+from baselines.phase import PhaseDriven
+from experiments.field.motions import HELD_OUT, IN_SAMPLE, Motion
+from experiments.field.references import CURVES, Reference, nearest_velocity
+from latentds import Demonstration, StableDS, certify, metrics
+from latentds.arguments import Array
+from latentds.benchmark import Cell
 from latentds.metrics import velocity_cosine
+from latentds.probes import unit_ball
 
-TRAINING = 4
-"""Demonstrations that protocol C trains on; it is judged by the others."""
-
-
-def thinned(shown: Demonstration, stride: int) -> Demonstration:
-    """Every ``stride``-th sample."""
-    return replace(shown, positions=shown.positions[::stride], dt=shown.dt * stride)
-
-
-def leave_one_out(label: str, factory: Factory, shape: Sequence[Demonstration], left_out: int, seed: int = 0) -> Cell:
-    """All demonstrations but one are shown, and that one, by number from 0, judges a rollout from its start."""
-    others, judge = _apart(shape, left_out)
-    return Cell(label, factory, called(f"all but {judge.name}", others), seed, judges=judge)
-
-
-def one_to_others(label: str, factory: Factory, shape: Sequence[Demonstration], shown: int, seed: int = 0) -> Cell:
-    """One demonstration, by number from 0, is shown, and each other judges a rollout from its start."""
-    judges, only = _apart(shape, shown)
-    return Cell(label, factory, only, seed, judges=judges)
+N_POINTS = 500
+BESIDE, N_BESIDE = 0.05, 8
+"""Radius of the ball around the first shown start, in sizes, and how many starts in it."""
+PUSH, N_PUSHES = 0.1, 4
+"""How far a motion is pushed off half-way, in sizes, and in how many directions."""
+HELD_FOR = 0.25
+"""Of the duration, about a second of handwriting: how long a motion is held still half-way."""
+ARRIVED, PATIENCE = 0.02, 20.0
+"""A motion has arrived when it stays within so many sizes of the goal; it is waited for so many durations."""
+N_CLAIMS = 200
+"""Points that a certificate's search tries."""
+DRAWN_GRID, DRAWN_POINTS = 25, 60
+"""Of the velocity field, per side, and of each motion, in what is kept for pictures."""
+THEIR_STEP, THEIR_STEPS, THEIR_START, THEIR_REST = 0.01, 3000, 20, 0.1
+"""ds-opt's simulations: seconds a step, steps at most, at which sample they begin, and the speed, in mm/s, that ends
+them. The last is ours: their setting is not told with the figures that they keep."""
 
 
-def called(name: str, shown: Sequence[Demonstration]) -> list[Demonstration]:
-    """Demonstrations of one name, which is then that of the cell: a progress bar has no room for seven."""
-    return [replace(one, name=name) for one in shown]
+def measured(ds: StableDS, cell: Cell, motion: Motion, pictured: bool) -> dict[str, Any]:
+    """For a cell's ``measure``: every figure that the motion's protocol has."""
+    with torch.no_grad():
+        figures = of_curves(motion, lambda starts, times: ds.rollout(starts, times).numpy())
+        figures |= pushed_and_held(ds, motion.shown[0]) | of_fields(ds, motion) | {"us": microseconds(ds, motion)}
+    return figures | (drawn(ds, motion) if pictured else {})
 
 
-def _apart(shape: Sequence[Demonstration], which: int) -> tuple[list[Demonstration], Demonstration]:
-    """The others, and the one of that number."""
-    if len(shape) < 2 or not whole_number(which, "which", at_least=0) < len(shape):
-        raise ValueError(f"shape: expected 2 demonstrations or more, and number {which} among them, got {len(shape)}")
-    return [one for i, one in enumerate(shape) if i != which], shape[which]
+def referred(motion: Motion) -> list[dict[str, Any]]:
+    """Rows of what learns nothing, with the figures that it has."""
+    rows = []
+    for label, curve in CURVES.items():
+        rows.append({"method": label} | of_curves(motion, _rollout_of(curve, motion)))
+    if motion.protocol == HELD_OUT:
+        rows.append({"method": "nearest velocity"} | of_velocities(lambda y: nearest_velocity(motion.shown, y), motion))
+    return rows
 
 
-def protocol_a(label: str, factory: Factory, shape: Sequence[Demonstration], seed: int = 0) -> Cell:
-    """In sample (CONDOR, PUMA): trained on all, judged by the same, see :func:`in_sample`.
+def _rollout_of(curve: Reference, motion: Motion) -> Callable[[Tensor, Tensor], Array]:
+    return lambda starts, times: np.stack([curve(motion.shown, start, times) for start in starts])
 
-    The first alone judges what every cell's rows tell, because each of its judges is rolled out on its own.
+
+# --- motions ----------------------------------------------------------------------------------------------------------
+
+Rollout = Callable[[Tensor, Tensor], Array]
+"""Starts (B, n), times (T,) -> (B, T, n)."""
+
+
+def of_curves(motion: Motion, rollout: Rollout) -> dict[str, float]:
+    """Distances of motions from the starts that a protocol asks for.
+
+    * ``own``: from each shown start to its demonstration, the mean.
+    * ``beside``: from ``N_BESIDE`` starts in a ball of ``BESIDE`` around the first shown one to that demonstration, the
+      mean.
+    * ``unseen``: from the start of each demonstration that was kept back to that demonstration, the mean.
+    * ``arrives``: of the shown starts and those beside, the share from which the motion is within ``ARRIVED`` of the
+      first shown goal when it is last looked at, after ``PATIENCE`` durations. ``arrival``: when, in durations, the
+      motion from the first start is there to stay; looked at 400 times.
+    * ``command``: the largest speed along the motions from shown starts, from one of ``N_POINTS`` points to the next,
+      over the largest along what was shown.
+    * ``dtwd``: raw sum, not over points and sizes, as protocol C has it; ``dtwd_theirs``: see :func:`their_dtwd`.
+    * ``rmse_a``, ``dtwd_a``, ``fd_a``: of protocol A, see :func:`path_errors`.
     """
-    together = called(f"{shape[0].name} to {shape[-1].name}", shape)
-    return Cell(label, factory, together, seed, judges=shape[:1], measure=in_sample)
+    shown, kept_back = motion.shown, () if motion.protocol == IN_SAMPLE else motion.judges
+    first = shown[0]
+    ball = unit_ball(N_BESIDE, first.dim, np.random.default_rng(0))
+    beside = first.start + BESIDE * first.size * torch.from_numpy(ball)
+    owns = [moved(rollout, one.start.unsqueeze(0), one)[0] for one in shown]
+    figures = {
+        "own": float(np.mean([distance(path, one) for path, one in zip(owns, shown, strict=True)])),
+        "beside": float(np.mean([distance(path, first) for path in moved(rollout, beside, first)])),
+        "command": max(fastest(path, one.duration) for path, one in zip(owns, shown, strict=True))
+        / max(fastest(one.at(even_times(one).numpy()), one.duration) for one in shown),
+    }
+    starts = torch.cat([torch.stack([one.start for one in shown]), beside])
+    looks = torch.linspace(0, PATIENCE * first.duration, 401, dtype=torch.float64)
+    left = np.linalg.norm(rollout(starts, looks) - first.goal.numpy(), axis=-1) / first.size
+    away = np.flatnonzero(~(left[0] <= ARRIVED))
+    figures["arrives"] = float((left[:, -1] <= ARRIVED).mean())
+    figures["arrival"] = PATIENCE * float(away[-1] + 1) / 400 if len(away) and away[-1] < 400 else float("nan")
+    if kept_back:
+        paths = [moved(rollout, one.start.unsqueeze(0), one)[0] for one in kept_back]
+        figures["unseen"] = float(np.mean([distance(p, one) for p, one in zip(paths, kept_back, strict=True)]))
+        if motion.protocol == HELD_OUT:
+            raw = [distance(p, one) * N_POINTS * one.size for p, one in zip(paths, kept_back, strict=True)]
+            figures |= {"dtwd": float(np.mean(raw)), "dtwd_theirs": their_dtwd(rollout, kept_back)}
+    if motion.protocol == IN_SAMPLE:
+        paths = [rollout(one.start.unsqueeze(0), one.times)[0] for one in motion.judges]
+        figures |= {f"{name}_a": value for name, value in path_errors(paths, motion.judges).items()}
+    return figures
 
 
-def in_sample(ds: StableDS, cell: Cell) -> dict[str, float]:
-    """Means over what was shown of the :func:`path_errors` of motions from the same starts, every tenth sample."""
-    judges = [thinned(one, 10) for one in cell.shown]
-    return path_errors([path.numpy() for path in motions(ds, judges)], judges)
+def moved(rollout: Rollout, starts: Tensor, judge: Demonstration) -> Array:
+    """Motions at ``N_POINTS`` even times of that demonstration's duration: (B, n) -> (B, N, n)."""
+    return rollout(starts, even_times(judge))
+
+
+def even_times(judge: Demonstration) -> Tensor:
+    return torch.linspace(0, judge.duration, N_POINTS, dtype=torch.float64)
+
+
+def distance(path: Array, judge: Demonstration) -> float:
+    """From a motion at :func:`even_times`; inf where the motion was lost."""
+    value = metrics.dtw(path, judge.at(even_times(judge).numpy())) / N_POINTS / judge.size
+    return value if np.isfinite(value) else np.inf
+
+
+def fastest(path: Array, duration: float) -> float:
+    """The largest speed along a path at even times."""
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).max()) * (len(path) - 1) / duration
+
+
+def their_dtwd(rollout: Rollout, kept_back: Sequence[Demonstration]) -> float:
+    """DTWD by ds-opt's rule, mm: raw sum of exact DTW between a motion and all samples of a demonstration, the mean.
+
+    The motion begins at sample ``THEIR_START`` and goes on in steps of ``THEIR_STEP`` until it rests, for
+    ``THEIR_STEPS`` at most, so that each step on which it lingers counts.
+    """
+    sums = []
+    times = THEIR_STEP * torch.arange(THEIR_STEPS, dtype=torch.float64)
+    for one in kept_back:
+        path = rollout(one.positions[min(THEIR_START, len(one)) - 1].unsqueeze(0), times)[0]
+        speeds = np.linalg.norm(np.diff(path, axis=0), axis=1) / THEIR_STEP
+        moving = np.flatnonzero(~(speeds < THEIR_REST))
+        sums.append(metrics.dtw(path[: moving[-1] + 2 if len(moving) else 1], one.positions))
+    value = float(np.mean(sums))
+    return value if np.isfinite(value) else np.inf
 
 
 def path_errors(paths: Sequence[Any], judges: Sequence[Demonstration]) -> dict[str, float]:
@@ -77,36 +164,18 @@ def path_errors(paths: Sequence[Any], judges: Sequence[Demonstration]) -> dict[s
     return dict(zip(("rmse", "dtwd", "fd"), np.mean(each, axis=0).tolist(), strict=True))
 
 
-def motions(ds: StableDS, demonstrations: Sequence[Demonstration]) -> list[Tensor]:
-    """From each one's start at its times; all at once, as many starts are integrated in the time of one."""
-    times, place = torch.cat([one.times for one in demonstrations]).unique(return_inverse=True)
-    with torch.no_grad():
-        paths = ds.rollout(torch.stack([one.start for one in demonstrations]), times)
-    places = place.split([len(one) for one in demonstrations])
-    return [path[at] for path, at in zip(paths, places, strict=True)]
+# --- fields -----------------------------------------------------------------------------------------------------------
 
 
-def protocol_c(label: str, factory: Factory, shape: Sequence[Demonstration], seed: int = 0) -> Cell:
-    """Held-out velocities (Figueroa and Billard 2018): trained on four, judged by the others, every second sample.
-
-    Rows tell, beside the usual, ``train_rmse``, ``train_e``, ``test_rmse`` and ``test_e``: see :func:`velocity_errors`;
-    and ``command``, the largest velocity along motions from the starts that were shown over the largest shown.
-    """
-    thin = [thinned(shown, 2) for shown in shape]
-    together = called(f"{shape[0].name} to {shape[TRAINING - 1].name}", thin[:TRAINING])
-    return Cell(label, factory, together, seed, judges=thin[TRAINING:], measure=held_out_velocities)
+def of_fields(ds: StableDS, motion: Motion) -> dict[str, float]:
+    """Of protocol C the :func:`of_velocities`; of every protocol ``own_e``, ė at what was shown."""
+    figures = {"own_e": velocity_errors(ds, motion.shown)["e"]}
+    return figures | (of_velocities(ds, motion) if motion.protocol == HELD_OUT else {})
 
 
-def held_out_velocities(ds: StableDS, cell: Cell) -> dict[str, float]:
-    """The velocity errors at the samples shown and at the judges', and the largest command."""
-    with torch.no_grad():
-        command = largest_speed(ds, torch.cat(motions(ds, cell.shown)))
-    fastest = max(float(one.velocities.norm(dim=-1).max()) for one in cell.shown)
-    return {"command": command / fastest} | {
-        f"{part}_{what}": value
-        for part, group in (("train", cell.shown), ("test", cell.judges))
-        for what, value in velocity_errors(ds, group).items()
-    }
+def of_velocities(field: Callable[[Tensor], Tensor], motion: Motion) -> dict[str, float]:
+    """``test_rmse``, ``test_e``: the :func:`velocity_errors` at the samples that were kept back."""
+    return {f"test_{name}": value for name, value in velocity_errors(field, motion.judges).items()}
 
 
 def velocity_errors(ds: Callable[[Tensor], Tensor], demonstrations: Sequence[Demonstration]) -> dict[str, float]:
@@ -123,3 +192,74 @@ def velocity_errors(ds: Callable[[Tensor], Tensor], demonstrations: Sequence[Dem
         missed = (ds(positions) - shown).numpy()
         cosine = velocity_cosine(ds(positions), shown)
     return {"rmse": float(np.sqrt(np.square(missed).mean(axis=1)).mean()), "e": 1 - cosine}
+
+
+def pushed_and_held(ds: StableDS, shown: Demonstration) -> dict[str, float]:
+    """What becomes of the second half of a demonstration when the motion is disturbed half-way.
+
+    * ``pushed``: it is at a point ``PUSH`` off in each of ``N_PUSHES`` directions; distance of the rest of the motion
+      to the second half of the demonstration, the mean.
+    * ``held``: it is held still for ``HELD_FOR``, released, and given the time that it had left. A field goes on where
+      it was; a clock ran on.
+    """
+    half = shown.duration / 2
+    there = ds.rollout(shown.start, torch.tensor([0.0, half], dtype=torch.float64))[-1]
+    ball = unit_ball(N_PUSHES, shown.dim, np.random.default_rng(1))
+    directions = torch.from_numpy(ball / np.linalg.norm(ball, axis=1, keepdims=True))
+    places = torch.cat([there + PUSH * shown.size * directions, there.unsqueeze(0)])
+    times = torch.linspace(0, half, N_POINTS // 2, dtype=torch.float64)
+    rest = shown.at((half + times).numpy())
+
+    def mean(paths: Tensor) -> float:
+        sums = [metrics.dtw(path.numpy(), rest) for path in paths]
+        value = float(np.mean(sums)) / len(times) / shown.size
+        return value if np.isfinite(value) else np.inf
+
+    if isinstance(ds, PhaseDriven):
+        pushed = ds.resume(places[:-1], half, half + times)
+        late = half + HELD_FOR * shown.duration
+        held = ds.resume(there, late, late + times, at_rest=True).unsqueeze(0)
+    else:
+        pushed, held = ds.rollout(places, times).split([N_PUSHES, 1])
+    return {"pushed": mean(pushed), "held": mean(held)}
+
+
+def microseconds(ds: StableDS, motion: Motion) -> float:
+    """``us``: median time of one velocity at one point, µs."""
+    point, spent = motion.shown[0].positions[len(motion.shown[0]) // 3], []
+    for _ in range(30):
+        began = time.perf_counter()
+        ds(point)
+        spent.append(time.perf_counter() - began)
+    return 1e6 * float(np.median(spent))
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------------
+
+
+def drawn(ds: StableDS, motion: Motion) -> dict[str, Any]:
+    """``claims``: verdicts of its certificate; ``drawn``: of planar motions what a picture needs, as JSON."""
+    lines = certify(ds, n_samples=N_CLAIMS).lines
+    counts = [sum(line.verdict == verdict for line in lines) for verdict in ("proven", "not falsified", "falsified")]
+    told: dict[str, Any] = {"claims": " / ".join(map(str, counts))}
+    if ds.dim == 2:
+        grid = np.stack(np.meshgrid(*window(motion)), axis=-1)
+        starts = torch.stack([one.start for one in (*motion.shown, *motion.judges)])
+        times = torch.linspace(0, 1.5 * motion.shown[0].duration, DRAWN_POINTS, dtype=torch.float64)
+        with torch.no_grad():
+            field, paths = ds(torch.from_numpy(grid)).numpy(), ds.rollout(starts, times).numpy()
+        digits = 4 - int(np.ceil(np.log10(motion.shown[0].size)))
+        told["drawn"] = json.dumps({"field": _rounded(field, digits), "paths": _rounded(paths, digits)})
+    return told
+
+
+def window(motion: Motion) -> tuple[Array, Array]:
+    """The grid's coordinates along both axes: a square around what was shown and kept back."""
+    every = torch.cat([one.positions for one in (*motion.shown, *motion.judges)]).numpy()
+    middle, reach = (every.max(0) + every.min(0)) / 2, 0.65 * np.ptp(every, axis=0).max()
+    x, y = (np.linspace(at - reach, at + reach, DRAWN_GRID) for at in middle)
+    return x, y
+
+
+def _rounded(values: Array, digits: int) -> list[Any]:
+    return np.where(np.isfinite(values), values, 0.0).round(digits).tolist()
