@@ -1,6 +1,6 @@
 """Every method of the field under the same protocols: ranks, tables, pictures and a page.
 
-    python -m experiments.field [--quick] [--data FILE …] [--out results/field] [--jobs N] [--dask tcp://…]
+    python -m experiments.field [--quick] [--data FILE …] [--out results/field] [--doc PAGE.md] [--jobs N] [--dask tcp://…]
 
 LASA handwriting, which `make lasa` installs, is most of it; without that the spirals, joint motions and strokes remain.
 Leaves rows.csv, summary.md, field.html and pictures in ``--out``.
@@ -36,6 +36,9 @@ def main(
     quick: Annotated[bool, typer.Option(help="Five motions, one seed: a few minutes.")] = False,
     data: Annotated[list[Path] | None, typer.Option(help="Recordings of yours, or folders of them.")] = None,
     out: Annotated[Path, typer.Option(help="Folder for rows, tables and pictures.")] = Path("results/field"),
+    doc: Annotated[
+        Path | None, typer.Option(help="A Markdown page to write, too; pictures go to images/field.")
+    ] = None,
     jobs: Annotated[int | None, typer.Option(help="Processes; all cores by default.")] = None,
     dask: Annotated[str | None, typer.Option(help="Scheduler of a Dask cluster, tcp://…, to run on.")] = None,
 ) -> None:
@@ -58,6 +61,8 @@ def main(
     report.write(out / "summary.md", text)
     pictures = page.pictures(rows, every, out)
     page.write(out / "field.html", rows, every, pictures)
+    if doc is not None:
+        report.write(doc, page.document(text, page.pictures(rows, every, doc.parent / "images" / "field")))
     console.print(text, markup=False, highlight=False, soft_wrap=True)
     console.print(f"wrote {out / 'field.html'}, with {len(pictures)} pictures")
 

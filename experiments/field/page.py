@@ -48,6 +48,8 @@ RANKED = {
     "pushed": "after a push",
 }
 """Questions, each a column of the ranks. Held still, a field goes on where it was, so that has no rank of its own."""
+CLOCKED = ("own", "beside", "unseen")
+"""What curves can be asked, too."""
 COUNTED_ONCE = (HELD_OUT, ALONE, YOURS)
 """Protocols whose motions are ranked: those of the others are of the same shapes again."""
 
@@ -71,11 +73,21 @@ def summary(rows: pd.DataFrame, every: Sequence[Motion]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def document(text: str, drawn: Sequence[Path]) -> str:
+    """A page of the docs: the summary under a title, with the pictures behind the ranks."""
+    verdict, ranks, rest = text.split("\n\n## ", 2)
+    shown = "\n\n".join(f"![{TOLD_PICTURES[path.stem]}](images/field/{path.name})" for path in drawn)
+    return f"{HEAD}\n\n{verdict}\n\n## {ranks}\n\n{shown}\n\n## {rest}"
+
+
 def sections(rows: pd.DataFrame, every: Sequence[Motion]) -> list[Section]:
     """What is told, in order."""
     first = rows[rows["seed"] == 0].assign(family=rows["motion"].map({one.name: family_of(one) for one in every}))
     rankings = {question: ranking for question in RANKED if (ranking := ranking_of(first, question)) is not None}
     parts = [Section("Verdict", verdict(first, rankings)), Section("Ranks", TOLD_RANKS, rank_table(rankings))]
+    clocks = [*PHASE_DRIVEN, *CURVES]
+    apart = {question: ranking for question in CLOCKED if (ranking := ranking_of(first, question, clocks)) is not None}
+    parts.append(Section("Ranks of what follows a clock", TOLD_CLOCKS, rank_table(apart)))
     parts.append(Section(f"Against {OURS}", TOLD_AGAINST, against_table(first)))
     for question, told in TOLD.items():
         if question in first and first[question].notna().any():
@@ -103,10 +115,24 @@ def family_of(motion: Motion) -> str:
 
 # --- words ------------------------------------------------------------------------------------------------------------
 
+HEAD = """# The field, compared
+
+Written by `make field ARGS='--doc docs/comparison.md'`; do not edit. Which method to take, in plain words:
+[Which method when](which-method.md)."""
+TOLD_PICTURES = {
+    "grid": "Shapes by methods: shown, black, kept back, grey, motions from all starts, coloured, and the field",
+    "ranks": "Mean ranks, a panel for each question",
+    "time": "Distance over fitting time",
+}
 TOLD_RANKS = (
     "Mean rank over motions, 1 the best, of the methods that are velocity fields; a failure ranks last; each "
     f"shape counts once. In brackets behind a question: over how many motions, and Nemenyi's critical difference at "
     f"{LEVEL:g}: two methods nearer than that are not told apart. **Bold**: not told apart from the best."
+)
+TOLD_CLOCKS = (
+    "ProMP and DMP follow a clock, and so do three curves that learn next to nothing: the mean of what was shown, and "
+    "the mean from a start, whose offset dies along it. They are ranked apart, for none is a field that a robot can be "
+    "pushed in. Of a single demonstration the mean is that itself."
 )
 TOLD_AGAINST = (
     f"Wilcoxon's signed-rank test over the same motions, corrected by Holm's procedure within a question: p, and "
@@ -188,17 +214,17 @@ def verdict(rows: pd.DataFrame, rankings: Mapping[str, Ranking]) -> str:
 # --- tables -----------------------------------------------------------------------------------------------------------
 
 
-def ranking_of(first: pd.DataFrame, question: str) -> Ranking | None:
-    """Of the fields; None where the question was not asked."""
-    scores = scores_of(first, question)
+def ranking_of(first: pd.DataFrame, question: str, methods: Sequence[str] = FIELDS) -> Ranking | None:
+    """Of these methods; None where the question was not asked."""
+    scores = scores_of(first, question, methods)
     return None if scores.empty else ranked(scores)
 
 
-def scores_of(first: pd.DataFrame, question: str) -> pd.DataFrame:
-    """(motions, fields) of one question, each shape once."""
+def scores_of(first: pd.DataFrame, question: str, methods: Sequence[str] = FIELDS) -> pd.DataFrame:
+    """(motions, methods) of one question, each shape once."""
     if question not in first:
         return pd.DataFrame()
-    chosen = first[first["method"].isin(FIELDS) & first["protocol"].isin(COUNTED_ONCE)]
+    chosen = first[first["method"].isin(methods) & first["protocol"].isin(COUNTED_ONCE)]
     asked = chosen.groupby("motion")[question].transform(lambda values: values.notna().any())
     return chosen[asked].pivot(index="motion", columns="method", values=question)
 
@@ -210,7 +236,9 @@ def rank_table(rankings: Mapping[str, Ranking]) -> pd.DataFrame:
         texts = {name: f"**{rank:.1f}**" if close[str(name)] else f"{rank:.1f}" for name, rank in ranking.mean.items()}
         columns[f"{RANKED[question]} ({ranking.n_motions}, {ranking.critical:.1f})"] = pd.Series(texts)
     order = pd.DataFrame({question: ranking.mean for question, ranking in rankings.items()}).mean(axis=1).sort_values()
-    return pd.DataFrame(columns).reindex(order.index).rename_axis("method")
+    table = pd.DataFrame(columns).reindex(order.index)
+    table.loc["*Friedman's p*"] = [f"{ranking.p:.1g}" for ranking in rankings.values()]
+    return table.rename_axis("method")
 
 
 def against_table(first: pd.DataFrame) -> pd.DataFrame:
@@ -340,10 +368,11 @@ def pictures(rows: pd.DataFrame, every: Sequence[Motion], out: Path) -> list[Pat
     rankings = {question: ranking for question in RANKED if (ranking := ranking_of(first, question)) is not None}
     figures["ranks"] = rank_picture(rankings)
     figures["time"] = accuracy_over_time(first)
+    out.mkdir(parents=True, exist_ok=True)
     paths = []
     for name, figure in figures.items():
         paths.append(out / f"{name}.png")
-        figure.savefig(paths[-1], dpi=110)
+        figure.savefig(paths[-1], dpi=80 if name == "grid" else 110)
     return paths
 
 
@@ -370,7 +399,7 @@ def grid(drawn: pd.DataFrame, every: Sequence[Motion]) -> Figure:
 def _draw(ax: Any, motion: Motion, x: Array, y: Array, field: Array, paths: Array, color: str) -> None:
     u, v = field[..., 0], field[..., 1]
     if np.hypot(u, v).max() > 0:
-        ax.streamplot(x, y, u, v, color="#BBBBBB", linewidth=0.4, arrowsize=0.4, density=0.9)
+        ax.streamplot(x, y, u, v, color="#BBBBBB", linewidth=0.4, arrowsize=0.4, density=0.7)
     for one in motion.judges:
         ax.plot(*one.positions.numpy().T, color="#888888", lw=0.6)
     for one in motion.shown:

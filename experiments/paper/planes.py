@@ -26,6 +26,8 @@ BALL_RADIUS = 0.05
 """Of the ball of starts in the plane, in sizes of the motion; the paper's 0.1 on the spirals' sphere."""
 ORBITS, RING_RADIUS = 12, 0.3
 """Starts of DMP's orbits, and how far they are from the demonstrated one, in sizes."""
+N_ORBIT_POINTS = 1800
+"""Of each orbit: at half as many, the chords of orbits that run together cross where these do not."""
 
 
 def planes(study: Study, document: Document) -> None:
@@ -137,7 +139,7 @@ def draw_orbits(shown: Demonstration, fitted: Mapping[str, StableDS], begins: Te
     figure = Figure(figsize=(5.2 * len(fitted), 5), dpi=DPI, layout="constrained")
     for axes, (method, ds) in zip(figure.subplots(1, len(fitted), squeeze=False)[0], fitted.items(), strict=True):
         with torch.no_grad():
-            paths = ds.rollout(begins, torch.linspace(0, 3 * shown.duration, 900)).numpy()
+            paths = ds.rollout(begins, torch.linspace(0, 3 * shown.duration, N_ORBIT_POINTS)).numpy()
         far = np.linalg.norm(paths - points[-1], axis=-1) > 0.05 * shown.size
         met = crossings(np.where(far[..., None], paths, np.nan))
         counts[method] = len(met)
