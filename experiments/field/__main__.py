@@ -72,7 +72,7 @@ def cells_of(every: Sequence[Motion], seeds: Sequence[int]) -> list[Cell]:
     return [
         Cell(
             label,
-            factory_of(label, motion.name),
+            factory_of(label, motion),
             called(motion.name, motion.shown),
             seed,
             judges=called(motion.name, motion.shown)[0],

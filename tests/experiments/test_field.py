@@ -67,10 +67,13 @@ def test_without_handwriting_there_are_motions_and_names_are_never_shared(monkey
 
 
 def test_printed_hyperparameters_are_taken_where_there_are_some():
-    assert factory_of("FDM", "unstable c=7")(3).n_layers == 150
-    assert factory_of("FDM", "unstable c=7")(3).beta == 0.6
-    assert factory_of("FDM", "hook")(2).n_layers is None
-    assert isinstance(factory_of(OURS, "unstable c=7")(3), TubeDS)
+    winding, hook = (Motion(name, field.ALONE, (wavy_motion(3),)) for name in ("unstable c=7", "hook"))
+    assert factory_of("FDM", winding)(3).n_layers == 150
+    assert factory_of("FDM", winding)(3).beta == 0.6
+    assert factory_of("FDM", hook)(2).n_layers is None
+    assert factory_of("ProMP", hook)(2).n_basis == 50
+    assert factory_of("ProMP", hook._replace(shown=hook.shown * 2))(2).n_basis == 20
+    assert isinstance(factory_of(OURS, winding)(3), TubeDS)
 
 
 # --- scores -----------------------------------------------------------------------------------------------------------
@@ -303,10 +306,12 @@ def test_the_verdict_names_where_ours_is_behind_and_only_where_it_is_told_apart(
     behind = rows_of(**many, TubeDS=[9.0] * 30)
     ranking = page.ranking_of(behind, "own")
     text = page.verdict(behind, {"own": ranking})
-    assert "behind it, in: repeats (FDM 1.0, TubeDS 4.0)" in text
-    assert "Lowest mean rank: FDM in repeats." in text
+    assert "among the fields to CLF-DM in repeats; FDM in repeats; SEDS in repeats;" in text
+    assert text.endswith("Lowest mean rank of the fields: FDM in repeats.")
     ahead = rows_of(**many, TubeDS=[1.0] * 30)
-    assert "behind it, in: none" in page.verdict(ahead, {"own": page.ranking_of(ahead, "own")})
+    assert "among the fields to none; on handwriting, among what is no field, to none" in page.verdict(
+        ahead, {"own": page.ranking_of(ahead, "own")}
+    )
     table = page.rank_table({"own": ranking})
     assert table.iloc[0, 0] == "**1.0**"
     assert table.loc["TubeDS"].iloc[0] == "4.0"
