@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from PIL import Image
 
 from experiments import report
 from experiments.field.methods import DRAWN_AT_RANDOM, METHODS, OURS, PHASE_DRIVEN
@@ -209,8 +210,8 @@ def verdict(rows: pd.DataFrame, rankings: Mapping[str, Ranking]) -> str:
     hard = ", ".join(f"{name} {value:.3f}" for name, value in zip(worst["motion"], worst["own"], strict=True))
     return (
         f"Where {OURS} loses: among the fields to {_lost(fields) or 'none'}; on handwriting, among what is no field, "
-        f"to {_lost(clocks) or 'none'} (Wilcoxon with Holm's correction, p < {LEVEL:g}). It repeats worst {hard} sizes. "
-        f"Lowest mean rank of the fields: {leads}."
+        f"to {_lost(clocks) or 'none'} (Wilcoxon with Holm's correction, p < {LEVEL:g}). It repeats worst {hard} "
+        f"sizes. Lowest mean rank of the fields: {leads}."
     )
 
 
@@ -388,6 +389,8 @@ def pictures(rows: pd.DataFrame, every: Sequence[Motion], out: Path) -> list[Pat
     for name, figure in figures.items():
         paths.append(out / f"{name}.png")
         figure.savefig(paths[-1], dpi=80 if name == "grid" else 110)
+        with Image.open(paths[-1]) as picture:
+            picture.convert("RGB").quantize(256).save(paths[-1], optimize=True)  # half of the bytes
     return paths
 
 
