@@ -44,6 +44,9 @@ class DMP(PhaseDriven):
     that are read from second differences; and a rollout is a sum of the responses to every ψ_i, which are tabulated
     once, instead of an integration.
 
+    The spring brings every motion to y*, as the force dies with the phase. What is proven to fall is a function of
+    position and velocity: the distance of the position alone may rise.
+
     ``fit_report.mse`` is of the positions from the demonstrated starts, per coordinate; ``n_layers`` is the number of
     basis functions. Several demonstrations are pooled; the ends and the duration are their means.
 

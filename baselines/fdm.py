@@ -12,6 +12,11 @@ from latentds.time_law import KnottedLaw
 class FDM(GreedyDS):
     """Fast diffeomorphic matching (Perrin and Schlehuber-Caissier 2016): ChebyshevDS with another latent line.
 
+    The latent point moves straight to the goal at one speed, and the layers of their Algorithm 1, in its bounds, carry
+    the line onto the demonstration: globally asymptotically stable by construction, whatever the layers are. Unlike the
+    paper's, the ends are pinned, so that the attractor is the goal itself; and β, μ and the number of layers may be
+    chosen by the rule of Gupta, Nayak and Billard (``n_layers=None``).
+
     The arguments are those of :class:`~latentds.methods.greedy.GreedyDS`.
     """
 

@@ -51,6 +51,10 @@ class SDSEF(FlowDS):
     winding demonstration in space that loss learns shortcuts, so there ``"tuned"`` also asks that the demonstration lie
     on one latent ray, which is where every motion of this system runs.
 
+    Every motion goes straight to x* in latent space, so the system is globally asymptotically stable by construction.
+    Differs from the authors' code in that the speed falls linearly within ``LINEAR_WITHIN`` latent lengths of x*, where
+    a unit vector jumps, and is held within the range that it had along the demonstrations, so that far motions arrive.
+
     ``fit_report.mse`` is the mean over all N n entries of the squared velocity error, (units / second)².
 
     Args:
