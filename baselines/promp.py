@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -65,10 +66,11 @@ class ProMP(PhaseDriven):
         return self._learned(shown, self.n_basis)
 
     def _weights(self, shown: Demonstration) -> Tensor:
-        values, _ = basis(self.n_basis, shown.times / shown.duration)
-        normal = values.mT @ values + RIDGE_WEIGHT * len(values) * torch.eye(self.n_basis, dtype=torch.float64)
-        solved: Tensor = torch.linalg.solve(normal, values.mT @ (shown.positions - shown.goal))
-        return solved + shown.goal
+        values = basis(self.n_basis, shown.times / shown.duration)[0].numpy()
+        ridge = (RIDGE_WEIGHT * len(values)) ** 0.5 * np.eye(self.n_basis)
+        wanted = np.concatenate([(shown.positions - shown.goal).numpy(), np.zeros((self.n_basis, self.dim))])
+        solved, *_ = np.linalg.lstsq(np.concatenate([values, ridge]), wanted)  # torch's rounds by its threads
+        return torch.from_numpy(solved) + shown.goal
 
     def motion(self, y: Tensor, since: float, s: Tensor, *, at_rest: bool = False) -> Tensor:
         return self._conditioned(y, since, basis(self.n_basis, s.clamp(max=1.0))[0])

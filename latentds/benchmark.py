@@ -35,6 +35,7 @@ def compare(
     radius: float | None = None,
     seeds: Sequence[int] = (0,),
     n_points: int = 500,
+    fast_dtw: bool = True,
     n_jobs: int | None = None,
     progress: bool = False,
     store: str | os.PathLike[str] | None = None,
@@ -58,6 +59,7 @@ def compare(
             and seed, and their offsets, for a given radius, for every demonstration.
         seeds: whole numbers >= 0, all different; each makes a cell of its own.
         n_points: >= 2 points per rollout, uniform in time over the demonstration's duration.
+        fast_dtw: whether to tell FastDTW, too, which costs forty times as much as exact DTW; without it NaN.
         n_jobs: processes, as joblib counts them. None: what ``joblib.parallel_config`` says around the call (that is
             how cells go to a Dask or Ray cluster, too), without it all local cores. Rows do not depend on it.
         progress: show a bar with method, demonstration and time left.
@@ -105,7 +107,9 @@ def compare(
         for seed in seeds
     ]
     _only_once("demonstrations", [cell.demonstration for cell in cells[:: len(methods) * len(seeds)]])
-    outcomes = run(cells, RolloutProtocol(n_starts, radius, n_points), n_jobs=n_jobs, progress=progress, store=store)
+    outcomes = run(
+        cells, RolloutProtocol(n_starts, radius, n_points, fast_dtw), n_jobs=n_jobs, progress=progress, store=store
+    )
     _try_out(cells)
     rows = table(cells, outcomes, paths)
     _warn_of_failures(rows)

@@ -261,6 +261,7 @@ def test_processes_and_threads_give_the_serial_rows():
 
 
 def test_progress_names_what_is_awaited(capsys):
+    rich.reconfigure()  # the command, tried in the same process, sends bars to stderr
     rows = compare({"Straight": Straight}, SPIRAL, progress=True, **QUICK)
     shown = capsys.readouterr().out
     assert len(rows) == 4

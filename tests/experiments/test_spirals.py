@@ -135,7 +135,7 @@ def test_the_command_leaves_rows_summary_settings_and_pictures(small, tmp_path):
     settings = json.loads((tmp_path / "new" / "settings.json").read_text())
     assert settings["methods"]["unstable c=7"]["Chebyshev"]["n_layers"] == 8
     assert settings["environment"]["packages"]["torch"]
-    assert settings["protocol"] == {"n_starts": 20, "radius": 0.1, "n_points": 500}
+    assert settings["protocol"] == {"n_starts": 20, "radius": 0.1, "n_points": 500, "fast_dtw": True}
 
 
 @pytest.mark.slow
