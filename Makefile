@@ -4,7 +4,7 @@ BIN := .venv/bin
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help compare test test-fast check speed ablation fuzz paper training field hard-curves lasa clean
+.PHONY: help compare test test-fast check speed ablation fuzz paper training field hard-curves lasa docs clean
 
 help: # What there is to make.
 	@grep -E '^[a-z -]+:.*# ' $(MAKEFILE_LIST) | sed -E 's/^([a-z -]+):[^#]*# (.*)/\1|\2/' | awk -F'|' '{printf "  make %-34s %s\n", $$1, $$2}'
@@ -33,6 +33,12 @@ hard-curves: .venv/installed # Seventy curves that are hard to learn from: which
 lasa: .venv/installed # LASA handwriting (free for non-commercial academic use), for the studies that can use it.
 	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev,lasa]'
 
+docs: .venv/installed # The site, in docs/_build: every block and gallery script is run, warnings are errors.
+	$(BIN)/pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev,docs]'
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build
+	$(BIN)/python -m pytest tests/test_docs.py
+	@echo "docs/_build/index.html"
+
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "latentds needs Python >= 3.10; say which: make PYTHON=python3.11 ...")'
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
@@ -42,4 +48,4 @@ lasa: .venv/installed # LASA handwriting (free for non-commercial academic use),
 	@touch $@
 
 clean: # Remove .venv and results.
-	rm -rf .venv results
+	rm -rf .venv results docs/_build docs/examples docs/sg_execution_times.rst

@@ -25,9 +25,10 @@ class ProMP(PhaseDriven):
     """Probabilistic movement primitive: y(s) = Σ_i w_i φ_i(s), w ~ N(μ, Σ), s = t / duration up to 1.
 
     Paraschos et al. 2013: φ are normalised Gaussians even in s; each demonstration's w is a least squares, μ their mean
-    and Σ their covariance, to which ``OBSERVATION_NOISE``² I is added, without which a single demonstration could begin
-    only where it began. A rollout is the mean motion given that it is at its start now and at the goal at the end,
-    eq. 5 with no noise, twice. One demonstration says nothing of how offsets die: they do within a basis function.
+    and Σ their covariance, with the square of ``OBSERVATION_NOISE`` added on its diagonal, without which a single
+    demonstration could begin only where it began. A rollout is the mean motion given that it is at its start now and at
+    the goal at the end, eq. 5 with no noise, twice. One demonstration says nothing of how offsets die: they do within a
+    basis function.
 
     At the end of the phase the motion stays where it is, at the goal. There is no attractor beyond that: it does not
     return to the goal from elsewhere, and cannot :meth:`resume` once its phase has ended.

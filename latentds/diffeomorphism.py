@@ -59,7 +59,7 @@ class Diffeomorphism(Tabulated, nn.Module, ABC):
 
     @abstractmethod
     def log_abs_det_jacobian(self, x: Tensor) -> Tensor:
-        """log |det J_ψ(x)|: (..., n) -> (...)."""
+        """The logarithm of the absolute determinant of J_ψ(x): (..., n) -> (...)."""
 
     def invertibility(self) -> Invertibility | None:
         """What proves this map invertible for the parameters that it has now; None if nothing does."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pkgutil
 import re
+import runpy
 from pathlib import Path
 
 import pytest
@@ -16,17 +17,34 @@ RELIABILITY = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
 TEST_NAMED = re.compile(r"`(test_\w+)::(test_\w+)`")
 
 
-def blocks():
+def programs():
+    """Of each page its blocks of Python, which go on from one another."""
     for page in [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]:
-        for number, block in enumerate(BLOCK.findall(page.read_text(encoding="utf-8"))):
-            yield pytest.param(block, id=f"{page.relative_to(ROOT)}-{number}")
+        if found := BLOCK.findall(page.read_text(encoding="utf-8")):
+            yield pytest.param(found, id=str(page.relative_to(ROOT)))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("block", list(blocks()))
-def test_code_runs_as_printed(block, tmp_path, monkeypatch):
+@pytest.mark.parametrize("blocks", list(programs()))
+def test_code_runs_as_printed(blocks, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    exec(compile(block, "<docs>", "exec"), {"__name__": "docs"})
+    names = {"__name__": "docs"}
+    for block in blocks:
+        exec(compile(block, "<docs>", "exec"), names)
+
+
+@pytest.mark.slow
+def test_the_template_keeps_the_contract():
+    runpy.run_path(str(ROOT / "docs" / "template.py"), run_name="__main__")
+
+
+def test_gallery_scripts_are_short_and_draw():
+    scripts = sorted((ROOT / "docs" / "gallery").glob("plot_*.py"))
+    assert len(scripts) >= 10
+    for script in scripts:
+        text = script.read_text(encoding="utf-8")
+        assert len(text.splitlines()) <= 45, script.name
+        assert "figure = " in text, script.name
 
 
 def test_readme_opens_with_an_example_of_25_lines_at_most():
