@@ -1,7 +1,9 @@
-"""Pictures of motions and scores. Every function returns a matplotlib Figure and leaves the backend alone.
+"""Pictures of motions and scores, which leave matplotlib's backend alone. A method has one colour in all of them.
 
-Save one with ``figure.savefig("name.png")``. A method has the same colour in every picture. ``paths`` is always
-{label: (B, T, n) rollouts}, over the demonstration's duration, of several the first one's; NaN in them leaves a gap.
+Small ones (:func:`motions`, :func:`field`, :func:`embedding`, :func:`tube`, :func:`speeds`) draw on axes that they are
+given and return them; they take what ``rollout`` returns. Whole ones return a Figure, to save with
+``figure.savefig("name.png")``; their ``paths`` are {label: (B, T, n) rollouts}, over the demonstration's duration, of
+several the first one's. NaN in paths leaves a gap.
 """
 
 from __future__ import annotations
@@ -15,9 +17,10 @@ from zlib import crc32
 
 import numpy as np
 import torch
+from scipy.linalg import null_space
 
 from .arguments import Array, number_in, real_array
-from .base import StableDS
+from .base import LatentDS, StableDS
 from .cell import joint_name, several
 from .curves import extent
 from .demonstration import Demonstration
@@ -42,6 +45,196 @@ DPI = 150
 def color_of(label: str) -> str:
     """The colour of a method, by its label alone."""
     return COLORS.get(label, OTHERS[crc32(label.encode()) % len(OTHERS)])
+
+
+# --- one picture, on axes of yours ------------------------------------------------------------------------------------
+
+
+def motions(
+    paths: Any,
+    demonstration: Demonstration | None = None,
+    ax: Any = None,
+    *,
+    times: Any = None,
+    label: str = "motions",
+) -> Any:
+    """Motions as ``rollout`` gives them, over what was shown: curves for n = 2 and 3, else coordinates over time.
+
+    Args:
+        paths: (T, n) or (B, T, n).
+        demonstration: drawn beneath, if there is one.
+        ax: matplotlib's axes, with ``projection="3d"`` for n = 3; new ones, on a figure of their own, if None.
+        times: (T,) seconds, of the coordinates; their numbers if None.
+        label: the method's name, which chooses the colour.
+
+    Returns:
+        The axes; ``ax.figure`` is their figure.
+
+    Raises:
+        ValueError: if the shapes do not fit.
+    """
+    batch = _batch(paths, None if demonstration is None else demonstration.dim)
+    dim, color = batch.shape[-1], color_of(label)
+    ax = _axes(dim) if ax is None else ax
+    if demonstration is not None and dim in (2, 3):
+        ax.plot(*demonstration.positions.numpy().T, "--", color=SHOWN, lw=1.6, label="demonstration")
+        ax.plot(*demonstration.goal.numpy()[:, None], "*", color="#E69F00", mec=SHOWN, ms=12)
+    elif demonstration is not None:
+        ax.plot(demonstration.times.numpy(), demonstration.positions.numpy(), "--", color=SHOWN, lw=1.2)
+    clock = np.arange(batch.shape[1]) if times is None else real_array(times, "times")
+    for i, path in enumerate(batch):
+        if dim in (2, 3):
+            ax.plot(*path.T, color=color, lw=1.0, alpha=0.8, label="" if i else label)
+        else:
+            ax.plot(clock, path, color=color, lw=1.0, alpha=0.8)
+    return ax
+
+
+def field(
+    ds: StableDS,
+    demonstration: Demonstration | Sequence[Demonstration],
+    ax: Any = None,
+    *,
+    margin: float = 0.35,
+    lyapunov: bool = False,
+) -> Any:
+    """Streamlines of a planar system around what was shown, over contours of √V if these are asked for.
+
+    Args:
+        ds, demonstration: of dimension 2.
+        ax: matplotlib's axes; new ones if None.
+        margin: >= 0, around the demonstrations, as a share of their size.
+        lyapunov: whether to draw V.
+
+    Returns:
+        The axes, limited to what was drawn.
+
+    Raises:
+        ValueError: for another dimension.
+    """
+    every = several(demonstration, "demonstration")
+    if ds.dim != 2 or every[0].dim != 2:
+        raise ValueError(f"ds: expected a system and a demonstration in 2-D, got {ds.dim}-D and {every[0].dim}-D")
+    margin = number_in(margin, "margin", 0, math.inf, ends="[)")
+    ax = _axes(2) if ax is None else ax
+    shown = np.concatenate([one.positions.numpy() for one in every])
+    border = margin * max(one.size for one in every)
+    (left, bottom), (right, top) = shown.min(axis=0) - border, shown.max(axis=0) + border
+    x, y = np.linspace(left, right, 60), np.linspace(bottom, top, 60)
+    places = torch.from_numpy(np.stack(np.meshgrid(x, y), axis=-1))
+    with torch.no_grad():
+        velocity = ds(places).numpy()
+        if lyapunov:
+            height = ds.lyapunov(places).clamp(min=0).sqrt().numpy()
+            ax.contourf(x, y, height, levels=20, cmap="Blues_r", alpha=0.7)
+    shade = "#FFFFFF" if lyapunov else "#AAAAAA"
+    ax.streamplot(x, y, velocity[..., 0], velocity[..., 1], color=shade, linewidth=0.7, arrowsize=0.8, density=1.6)
+    ax.set(xlim=(left, right), ylim=(bottom, top))
+    return ax
+
+
+def embedding(ds: LatentDS, demonstration: Demonstration, paths: Any = None, ax: Any = None) -> Any:
+    """Motions in latent space, in any dimension: progress along the latent line, and distance from it.
+
+    Args:
+        ds: fitted.
+        demonstration: encoded and drawn in black: how near it lies to the line is how well it was matched.
+        paths: (T, n) or (B, T, n), or None.
+        ax: matplotlib's axes; new ones if None.
+
+    Returns:
+        The axes: 1 is the demonstrated start, 0 the goal; distances are in lengths of the line.
+    """
+    ax = _axes(2) if ax is None else ax
+    frame = ds.frame()
+
+    def place(points: Any) -> tuple[Array, Array]:
+        with torch.no_grad():
+            offset = (ds.encode(torch.as_tensor(points)) - frame.attractor) / frame.length
+            progress = offset @ frame.axis
+            across = torch.linalg.vector_norm(offset - progress.unsqueeze(-1) * frame.axis, dim=-1)
+        return progress.numpy(), across.numpy()
+
+    for path in [] if paths is None else _batch(paths, ds.dim):
+        ax.plot(*place(path), color=color_of(type(ds).__name__), lw=1.0, alpha=0.8)
+    ax.plot(*place(demonstration.positions), color=SHOWN, lw=1.6, ls="--", label="demonstration")
+    ax.set_aspect("auto")
+    ax.set(xlabel="progress to go", ylabel="distance from the latent line")
+    ax.invert_xaxis()
+    return ax
+
+
+def tube(ds: LatentDS, demonstration: Demonstration, ax: Any = None, *, radius: float = 0.05) -> Any:
+    """What ψ makes of straight lines around the latent one: how the surroundings of the path bend with it; n = 2 or 3.
+
+    Args:
+        ds, demonstration: of dimension 2 or 3.
+        ax: matplotlib's axes, with ``projection="3d"`` for n = 3; new ones if None.
+        radius: > 0, of the lines' distance, in lengths of the latent line.
+
+    Returns:
+        The axes.
+
+    Raises:
+        ValueError: for another dimension or radius.
+    """
+    if ds.dim not in (2, 3):
+        raise ValueError(f"ds: expected 2 or 3 dimensions, got {ds.dim}")
+    radius = number_in(radius, "radius", 0, math.inf)
+    ax = _axes(ds.dim) if ax is None else ax
+    frame = ds.frame()
+    sides = torch.from_numpy(null_space(frame.axis.detach().numpy()[None]))
+    turns = torch.arange(2 if ds.dim == 2 else 12) * (2 * math.pi / (2 if ds.dim == 2 else 12))
+    ring = torch.stack([turns.cos(), turns.sin()], dim=-1)[:, : ds.dim - 1].to(sides) @ sides.mT
+    along = torch.linspace(1, 0, 300, dtype=torch.float64).unsqueeze(-1) * frame.axis
+    with torch.no_grad():
+        lines = ds.decode(frame.attractor + frame.length * (along + radius * ring.unsqueeze(1))).numpy()
+    for line in lines:
+        ax.plot(*line.T, color=color_of("TubeDS"), lw=0.7, alpha=0.7)
+    ax.plot(*demonstration.positions.numpy().T, "--", color=SHOWN, lw=1.6, label="demonstration")
+    return ax
+
+
+def speeds(
+    paths: Any, times: Any, demonstration: Demonstration | None = None, ax: Any = None, *, label: str = "motions"
+) -> Any:
+    """Speeds over time of motions (T, n) or (B, T, n) at ``times`` (T,), seconds, over those that were shown.
+
+    Returns:
+        The axes: ``ax``, or new ones.
+    """
+    batch, clock = _batch(paths, None if demonstration is None else demonstration.dim), real_array(times, "times")
+    if clock.shape != (batch.shape[1],):
+        raise ValueError(f"times: expected ({batch.shape[1]},) as the paths have, got {clock.shape}")
+    ax = _axes(1) if ax is None else ax
+    if demonstration is not None:
+        shown = torch.linalg.vector_norm(demonstration.velocities, dim=-1)
+        ax.plot(demonstration.times.numpy(), shown.numpy(), "--", color=SHOWN, lw=1.6, label="demonstration")
+    for i, path in enumerate(batch):
+        speed = np.linalg.norm(np.gradient(path, clock, axis=0), axis=1)
+        ax.plot(clock, speed, color=color_of(label), lw=1.0, alpha=0.8, label="" if i else label)
+    ax.set(xlabel="time [s]", ylabel="speed")
+    return ax
+
+
+def _axes(dim: int) -> Any:
+    figure = Figure(figsize=(5.6, 5.2) if dim in (2, 3) else (7.0, 3.6), dpi=DPI, layout="constrained")
+    ax = figure.add_subplot(projection="3d") if dim == 3 else figure.add_subplot()
+    if dim in (2, 3):
+        _quiet(ax)
+    return ax
+
+
+def _batch(paths: Any, dim: int | None) -> Array:
+    """Paths (B, T, n) of one (T, n) or many."""
+    values = real_array(paths, "paths")
+    batch = values[None] if values.ndim == 2 else values
+    if batch.ndim != 3 or (dim is not None and batch.shape[-1] != dim):
+        raise ValueError(f"paths: expected (T, {dim or 'n'}) or (B, T, {dim or 'n'}), got {values.shape}")
+    return batch
+
+
+# --- whole figures ----------------------------------------------------------------------------------------------------
 
 
 def replications(
@@ -106,21 +299,9 @@ def vector_field(
         ValueError: for another n, or paths that do not fit the demonstration.
     """
     every = several(demonstration, "demonstration")
-    if ds.dim != 2 or every[0].dim != 2:
-        raise ValueError(f"ds: expected a system and a demonstration in 2-D, got {ds.dim}-D and {every[0].dim}-D")
-    margin = number_in(margin, "margin", 0, math.inf, ends="[)")
-    moved = {} if paths is None else _moved({label: paths}, every[0])
-    shown = np.concatenate([one.positions.numpy() for one in every])
-    border = margin * max(one.size for one in every)
-    (left, bottom), (right, top) = shown.min(axis=0) - border, shown.max(axis=0) + border
-    x, y = np.linspace(left, right, 60), np.linspace(bottom, top, 60)
-    with torch.no_grad():
-        velocity = ds(torch.from_numpy(np.stack(np.meshgrid(x, y), axis=-1))).numpy()
     figure = Figure(figsize=(5.6, 5.6), dpi=DPI, layout="constrained")
-    axes = figure.add_subplot()
-    axes.streamplot(
-        x, y, velocity[..., 0], velocity[..., 1], color="#AAAAAA", linewidth=0.7, arrowsize=0.8, density=1.6
-    )
+    axes = field(ds, every, figure.add_subplot(), margin=margin)
+    moved = {} if paths is None else _moved({label: paths}, every[0])
     for batch in moved.values():
         for i, path in enumerate(batch):
             axes.plot(*path.T, color=color_of(label), lw=1.2, alpha=0.7, label="" if i else label)
@@ -131,7 +312,7 @@ def vector_field(
         axes.plot(*one.start.numpy(), "o", color=SHOWN, ms=6, label=names[1])
         axes.plot(*one.goal.numpy(), "*", color="#E69F00", mec=SHOWN, ms=15, label=names[2])
     first, second = _labels(every[0])
-    axes.set(xlim=(left, right), ylim=(bottom, top), xlabel=first, ylabel=second, title=joint_name(every))
+    axes.set(xlabel=first, ylabel=second, title=joint_name(every))
     axes.set_aspect("equal")
     figure.legend(loc="outside lower center", ncols=4, fontsize=9, frameon=False)
     return figure

@@ -12,8 +12,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from baselines import FDM
-from latentds import ChebyshevDS, Demonstration, datasets, plotting
+from latentds import ChebyshevDS, Demonstration, TubeDS, datasets, plotting
 from latentds.benchmark import compare
+from latentds.testing import wavy_motion
 
 
 def spread(demonstration, n=3):
@@ -170,3 +171,74 @@ def test_pictures_name_the_coordinates_as_the_recording_does():
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("shoulder", r"cost \$")
     assert plotting.joints(flat, {}).axes[0].get_ylabel() == "shoulder [rad]"
     assert plotting.vector_field(ChebyshevDS(2), flat).axes[0].get_xlabel() == "shoulder"
+
+
+@pytest.fixture(scope="module")
+def hook():
+    shown = datasets.drawn("hook", 80)
+    return TubeDS(2, n_layers=60, refined=False).fit(shown), shown
+
+
+def lines_of(axes):
+    return [line.get_xydata() for line in axes.get_lines()]
+
+
+def test_motions_takes_what_rollout_returns_in_every_dimension():
+    for dim in (1, 2, 3, 7):
+        shown = wavy_motion(dim, n_points=40)
+        paths = torch.from_numpy(spread(shown))
+        own = plotting.motions(paths, shown, times=shown.times, label="FDM")
+        assert painted(own.figure).min() < 255
+        curves = 3 * (1 if dim in (2, 3) else dim)
+        assert [line.get_color() for line in own.get_lines()].count(plotting.color_of("FDM")) == curves
+        one = plotting.motions(paths[0])
+        assert len(one.get_lines()) == curves // 3
+    given = Figure().add_subplot()
+    assert plotting.motions(spread(wavy_motion(2)), ax=given) is given
+    with pytest.raises(ValueError, match=r"paths: expected \(T, 2\) or \(B, T, 2\)"):
+        plotting.motions(np.zeros((4, 5, 3)), wavy_motion(2))
+
+
+def test_a_field_shows_v_and_where_motions_go(hook):
+    ds, shown = hook
+    axes = plotting.field(ds, shown, lyapunov=True)
+    heights = axes.collections[0].norm
+    corners = torch.cartesian_prod(
+        *(torch.tensor(axis(), dtype=torch.float64) for axis in (axes.get_xlim, axes.get_ylim))
+    )
+    assert float(ds.lyapunov(corners).max().sqrt()) <= heights.vmax * 1.1
+    assert painted(axes.figure).min() < 255
+    with pytest.raises(ValueError, match="ds: expected a system and a demonstration in 2-D"):
+        plotting.field(TubeDS(3), wavy_motion(3))
+
+
+def test_an_embedding_is_progress_and_distance_from_the_line(hook):
+    ds, shown = hook
+    axes = plotting.embedding(ds, shown, shown.positions)
+    progress, across = lines_of(axes)[-1].T
+    assert progress[[0, -1]] == pytest.approx([1, 0], abs=1e-6)
+    frame = ds.frame()
+    offset = (ds.encode(shown.positions[40]) - frame.attractor) / frame.length
+    assert across[40] ** 2 == pytest.approx(float(offset.square().sum() - (offset @ frame.axis) ** 2), abs=1e-12)
+
+
+def test_a_tube_is_the_image_of_lines_beside_the_latent_one(hook):
+    ds, shown = hook
+    line = lines_of(plotting.tube(ds, shown, radius=0.1))[0]
+    frame = ds.frame()
+    offset = (ds.encode(torch.from_numpy(line)) - frame.attractor) / frame.length
+    away = (offset.square().sum(-1) - (offset @ frame.axis) ** 2).sqrt()
+    assert away.detach().numpy() == pytest.approx(np.full(300, 0.1), abs=1e-6)
+    solid = plotting.tube(TubeDS(3, n_layers=30, refined=False).fit(wavy_motion(3)), wavy_motion(3))
+    assert len(solid.get_lines()) == 13
+    with pytest.raises(ValueError, match="ds: expected 2 or 3 dimensions, got 7"):
+        plotting.tube(TubeDS(7), wavy_motion(7))
+
+
+def test_speeds_are_those_of_the_motions():
+    times = np.linspace(0, 2, 50)
+    path = np.stack([3 * times, 4 * times], axis=1)
+    axes = plotting.speeds(path, times)
+    assert lines_of(axes)[0][:, 1] == pytest.approx(np.full(50, 5.0))
+    with pytest.raises(ValueError, match=r"times: expected \(50,\)"):
+        plotting.speeds(path, times[1:])
