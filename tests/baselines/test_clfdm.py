@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from baselines import CLFDM
-from baselines.clfdm import ARRIVING_RADIUS, DESCENT_RATE, AsymmetricQuadratics
+from baselines.clfdm import ARRIVING_RADIUS, ARRIVING_RATE, DESCENT_RATE, AsymmetricQuadratics
 from latentds import Demonstration
 from latentds.testing import parametrize_stable_ds, wavy_motion
 
@@ -75,6 +75,19 @@ def test_the_correction_is_the_least_that_does():
     torch.testing.assert_close(along[~descends].abs(), change[~descends].norm(dim=-1))
     corrected = (slope * ds.normalized_velocity(z)).sum(-1)[~descends]
     torch.testing.assert_close(corrected, -DESCENT_RATE * energy[~descends])
+
+
+def test_v_stays_as_steep_as_it_began_and_motions_arrive():
+    """Directions that no V has leave its steepness open: without a weight it grew a hundred thousandfold."""
+    shown = Demonstration(there_and_back(), 0.01)
+    ds = CLFDM(2, n_components=3, seed=0).fit(shown)
+    assert max(float(part.detach().abs().max()) for part in ds.energy.parameters()) < 100
+    with torch.no_grad():
+        left = ds.rollout(shown.start, torch.tensor([0.0, 3 * shown.duration]))[-1] - shown.goal
+        u = 1e-4 * torch.tensor([[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)
+        pulled = ds.normalized_velocity(u)
+    assert float(left.norm()) < 0.02 * shown.size
+    assert bool(((pulled * u).sum(-1) < -ARRIVING_RATE / 2 * u.square().sum(-1)).all())
 
 
 def test_it_tells_where_demonstrations_rise():

@@ -89,6 +89,14 @@ def test_follows_a_winding_spiral():
     assert report.fidelity.miss < 0.08
 
 
+@pytest.mark.parametrize("dim", [3, 7])
+def test_learns_what_leaves_most_directions_open(dim):
+    """A straight line, and a motion of an arm on which the solver once found no end."""
+    way = torch.linspace(1, 0, 200, dtype=torch.float64).unsqueeze(-1)
+    shown = datasets.joint_motion(3) if dim == 7 else Demonstration(way * torch.tensor([1.0, 2.0, 0.5]), 0.01)
+    assert LPVDS(dim, seed=0).fit(shown).fit_report.fidelity.miss < 0.06
+
+
 @pytest.mark.parametrize(("argument", "value"), [("n_components", 0), ("seed", -1)])
 def test_bad_arguments_are_named(argument, value):
     with pytest.raises(ValueError, match=f"^{argument}: expected"):

@@ -303,3 +303,12 @@ def test_a_map_that_is_replaced_leaves_no_tables(fitted):
     with reference():
         wanted = ds(y)
     torch.testing.assert_close(ds(y), wanted)
+
+
+def test_in_the_plane_and_from_several_velocities_are_learned():
+    hook = datasets.drawn("hook", 200)
+    assert SDSEF(2, n_layers=6, n_features=80, seed=0, epochs=200).fit(hook).fit_report.fidelity.miss < 0.02
+    way = torch.linspace(1, 0, 200, dtype=torch.float64).unsqueeze(-1)
+    shown = [Demonstration(hook.positions + sign * 0.1 * way, hook.dt) for sign in (-1, 1)]
+    several = SDSEF(2, n_layers=6, n_features=80, seed=0, epochs=200).fit(shown)
+    assert several.fit_report.fidelity.miss < 0.04
