@@ -24,6 +24,7 @@ from .base import LatentDS, StableDS
 from .cell import joint_name, several
 from .curves import extent
 from .demonstration import Demonstration
+from .dynamics import Frame
 
 try:
     from matplotlib.figure import Figure
@@ -64,7 +65,7 @@ def motions(
         paths: (T, n) or (B, T, n).
         demonstration: drawn beneath, if there is one.
         ax: matplotlib's axes, with ``projection="3d"`` for n = 3; new ones, on a figure of their own, if None.
-        times: (T,) seconds, of the coordinates; their numbers if None.
+        times: (T,) seconds, of the coordinates; if None even over the demonstration's duration, without one numbers.
         label: the method's name, which chooses the colour.
 
     Returns:
@@ -81,7 +82,10 @@ def motions(
         ax.plot(*demonstration.goal.numpy()[:, None], "*", color="#E69F00", mec=SHOWN, ms=12)
     elif demonstration is not None:
         ax.plot(demonstration.times.numpy(), demonstration.positions.numpy(), "--", color=SHOWN, lw=1.2)
-    clock = np.arange(batch.shape[1]) if times is None else real_array(times, "times")
+    last = batch.shape[1] - 1 if demonstration is None else demonstration.duration
+    clock = np.linspace(0, last, batch.shape[1]) if times is None else real_array(times, "times")
+    if clock.shape != (batch.shape[1],):
+        raise ValueError(f"times: expected ({batch.shape[1]},) as the paths have, got {clock.shape}")
     for i, path in enumerate(batch):
         if dim in (2, 3):
             ax.plot(*path.T, color=color, lw=1.0, alpha=0.8, label="" if i else label)
@@ -145,8 +149,8 @@ def embedding(ds: LatentDS, demonstration: Demonstration, paths: Any = None, ax:
     Returns:
         The axes: 1 is the demonstrated start, 0 the goal; distances are in lengths of the line.
     """
+    frame = _frame(ds)
     ax = _axes(2) if ax is None else ax
-    frame = ds.frame()
 
     def place(points: Any) -> tuple[Array, Array]:
         with torch.no_grad():
@@ -180,10 +184,9 @@ def tube(ds: LatentDS, demonstration: Demonstration, ax: Any = None, *, radius: 
     """
     if ds.dim not in (2, 3):
         raise ValueError(f"ds: expected 2 or 3 dimensions, got {ds.dim}")
-    radius = number_in(radius, "radius", 0, math.inf)
+    radius, frame = number_in(radius, "radius", 0, math.inf), _frame(ds)
     ax = _axes(ds.dim) if ax is None else ax
-    frame = ds.frame()
-    sides = torch.from_numpy(null_space(frame.axis.detach().numpy()[None]))
+    sides = torch.from_numpy(null_space(frame.axis.numpy()[None]))
     turns = torch.arange(2 if ds.dim == 2 else 12) * (2 * math.pi / (2 if ds.dim == 2 else 12))
     ring = torch.stack([turns.cos(), turns.sin()], dim=-1)[:, : ds.dim - 1].to(sides) @ sides.mT
     along = torch.linspace(1, 0, 300, dtype=torch.float64).unsqueeze(-1) * frame.axis
@@ -215,6 +218,13 @@ def speeds(
         ax.plot(clock, speed, color=color_of(label), lw=1.0, alpha=0.8, label="" if i else label)
     ax.set(xlabel="time [s]", ylabel="speed")
     return ax
+
+
+def _frame(ds: LatentDS) -> Frame:
+    """Of the latent space, in float64 and without gradients, whatever the system is in."""
+    if not isinstance(ds, LatentDS):
+        raise ValueError(f"ds: expected a LatentDS, which has a latent space, got {type(ds).__name__}")
+    return Frame(*(part.detach().to("cpu", torch.float64) for part in ds.frame()))
 
 
 def _axes(dim: int) -> Any:

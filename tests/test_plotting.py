@@ -1,5 +1,6 @@
 """Pictures: right panels, nothing global touched, failures not hidden."""
 
+import copy
 import subprocess
 import sys
 from dataclasses import replace
@@ -242,3 +243,23 @@ def test_speeds_are_those_of_the_motions():
     assert lines_of(axes)[0][:, 1] == pytest.approx(np.full(50, 5.0))
     with pytest.raises(ValueError, match=r"times: expected \(50,\)"):
         plotting.speeds(path, times[1:])
+
+
+def test_pictures_take_a_float32_system_and_motions_with_gradients(hook):
+    ds, shown = copy.deepcopy(hook[0]).to(torch.float32), hook[1]
+    path = ds.rollout(shown.start, shown.times)
+    assert path.requires_grad
+    plotting.motions(path, shown)
+    plotting.speeds(path, shown.times, shown)
+    plotting.tube(ds, shown)
+    assert np.isfinite(lines_of(plotting.embedding(ds, shown, path))[0]).all()
+    with pytest.raises(ValueError, match="ds: expected a LatentDS, which has a latent space, got MovedDS"):
+        plotting.embedding(ds.with_goal(shown.goal + 0.01), shown)
+
+
+def test_coordinates_and_what_was_shown_have_one_clock():
+    shown = wavy_motion(4, n_points=40)
+    lines = lines_of(plotting.motions(shown.positions, shown))
+    assert all(line[-1, 0] == pytest.approx(shown.duration) for line in lines)
+    with pytest.raises(ValueError, match=r"times: expected \(40,\)"):
+        plotting.motions(shown.positions, times=shown.times[1:])

@@ -91,7 +91,7 @@ def is_pictured(motion: Motion) -> bool:
 
 def rows_of(every: Sequence[Motion], cells: Sequence[Cell], done: Sequence[Outcome]) -> pd.DataFrame:
     """A row for each fit, and for each curve that learns nothing, with the columns "motion" and "protocol"."""
-    fits = table(cells, done).groupby(["method", "demonstration", "seed"], sort=False).first().reset_index()
+    fits = table(cells, done)
     beside = [row | {"demonstration": motion.name, "seed": 0} for motion in every for row in referred(motion)]
     rows = pd.concat([fits, pd.DataFrame(beside)], ignore_index=True).rename(columns={"demonstration": "motion"})
     rows["protocol"] = rows["motion"].map({motion.name: motion.protocol for motion in every})

@@ -21,7 +21,6 @@ from experiments.field.ranks import LEVEL, Ranking, against, ranked
 from experiments.field.references import CURVES
 from experiments.field.scores import (
     ARRIVED,
-    BESIDE,
     HELD_FOR,
     N_BESIDE,
     N_POINTS,
@@ -34,6 +33,7 @@ from experiments.published import HELD_OUT_HANDWRITING
 from latentds import plotting
 from latentds import report as latentds_report
 from latentds.arguments import Array
+from latentds.cell import STARTS_WITHIN
 from latentds.files import atomic_write
 
 FIELDS = [label for label in METHODS if label not in PHASE_DRIVEN]
@@ -147,7 +147,7 @@ TOLD = {
     ),
     "beside": (
         "From beside the shown start",
-        f"The same from {N_BESIDE} starts in a ball of {BESIDE:g} sizes around the first shown one.",
+        f"The same from {N_BESIDE} starts in a ball of {STARTS_WITHIN:g} sizes around the first shown one.",
     ),
     "unseen": (
         "From starts that were not shown",
@@ -182,7 +182,7 @@ TOLD_PUBLISHED = (
     "Protocol C, mean ± standard deviation over shapes. Velocity RMSE, mm/s: mean over samples of the root of the mean "
     "over coordinates; ė: mean of 1 − cos; DTWD, mm: raw sum of exact DTW over 500 points from the kept-back starts. "
     "DTWD by ds-opt's rule: from the twentieth sample, 0.01 s a step until rest, so that slow arrival counts; the "
-    "speed that counts as rest is ours. CONDOR and PUMA print box plots only, so nothing of theirs stands here."
+    "speed that counts as rest is ours. Of CONDOR and PUMA no printed numbers were found."
 )
 TOLD_COST = (
     "Medians over all motions, fits without the library's own measuring of what was learned; one thread. A velocity: "
@@ -220,10 +220,9 @@ def _lost(scores: Mapping[str, pd.DataFrame]) -> str:
     better: dict[str, list[str]] = {}
     for question, of in scores.items():
         if OURS in of and of.shape[1] > 1:
-            p, filled = against(of, OURS), of.fillna(np.inf)
-            for method in p.index[p < LEVEL]:
-                if (filled[method] < filled[OURS]).sum() > (filled[method] > filled[OURS]).sum():
-                    better.setdefault(method, []).append(RANKED[question])
+            found = against(of, OURS)
+            for method in found.index[(found["p"] < LEVEL) & found["better"]]:
+                better.setdefault(method, []).append(RANKED[question])
     return "; ".join(f"{method} in {', '.join(questions)}" for method, questions in better.items())
 
 
@@ -262,12 +261,8 @@ def against_table(first: pd.DataFrame) -> pd.DataFrame:
     for question, title in RANKED.items():
         scores = scores_of(first, question)
         if not scores.empty and OURS in scores:
-            p = against(scores, OURS)
-            filled = scores.fillna(np.inf)
-            better = {
-                name: (filled[name] < filled[OURS]).sum() > (filled[name] > filled[OURS]).sum() for name in p.index
-            }
-            columns[title] = pd.Series({name: f"{p[name]:.2g} {'+' if better[name] else '−'}" for name in p.index})
+            found = against(scores, OURS)
+            columns[title] = found["p"].map("{:.2g} ".format) + found["better"].map({True: "+", False: "−"})
     return pd.DataFrame(columns).reindex([one for one in FIELDS if one != OURS]).rename_axis("method")
 
 

@@ -42,16 +42,22 @@ def ranked(scores: pd.DataFrame) -> Ranking:
     return Ranking(ranks.mean().sort_values(kind="stable"), p, critical, count)
 
 
-def against(scores: pd.DataFrame, one: str) -> pd.Series[float]:
-    """p of Wilcoxon's signed-rank test of each other method against ``one``, corrected by Holm's procedure."""
+def against(scores: pd.DataFrame, one: str) -> pd.DataFrame:
+    """Each other method against ``one``.
+
+    Returns:
+        A row for each, with "p" of Wilcoxon's signed-rank test, corrected by Holm's procedure, and whether it is
+        "better" on more motions than it is worse on.
+    """
     scores = failures_last(scores)
     largest = scores.replace(np.inf, np.nan).max().max()
     known = scores.replace(np.inf, 10 * largest)  # a failure is a larger difference than any other
-    raw = {}
+    raw, better = {}, {}
     for other in known.columns.drop(one):
         apart = known[other] - known[one]
         raw[other] = float(stats.wilcoxon(apart).pvalue) if (apart != 0).any() else 1.0
-    return holm(pd.Series(raw, dtype=float))
+        better[other] = bool((apart < 0).sum() > (apart > 0).sum())
+    return pd.DataFrame({"p": holm(pd.Series(raw, dtype=float)), "better": pd.Series(better, dtype=bool)})
 
 
 def holm(p: pd.Series[float]) -> pd.Series[float]:

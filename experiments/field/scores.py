@@ -18,15 +18,16 @@ from torch import Tensor
 from baselines.phase import PhaseDriven
 from experiments.field.motions import HELD_OUT, IN_SAMPLE, Motion
 from experiments.field.references import CURVES, Reference, nearest_velocity
+from experiments.report import mean_or_inf
 from latentds import Demonstration, StableDS, certify, metrics
 from latentds.arguments import Array
-from latentds.benchmark import Cell
+from latentds.benchmark import Cell, RolloutProtocol
 from latentds.metrics import velocity_cosine
 from latentds.probes import unit_ball
 
-N_POINTS = 500
-BESIDE, N_BESIDE = 0.05, 8
-"""Radius of the ball around the first shown start, in sizes, and how many starts in it."""
+N_POINTS, N_BESIDE = 500, 8
+"""Of each motion, and how many starts lie around the first shown one."""
+JUDGED = RolloutProtocol(N_BESIDE, n_points=N_POINTS)
 PUSH, N_PUSHES = 0.1, 4
 """How far a motion is pushed off half-way, in sizes, and in how many directions."""
 HELD_FOR = 0.25
@@ -46,7 +47,8 @@ def measured(ds: StableDS, cell: Cell, motion: Motion, pictured: bool) -> dict[s
     """For a cell's ``measure``: every figure that the motion's protocol has."""
     with torch.no_grad():
         figures = of_curves(motion, lambda starts, times: ds.rollout(starts, times).numpy())
-        figures |= pushed_and_held(ds, motion.shown[0]) | of_fields(ds, motion) | {"us": microseconds(ds, motion)}
+        figures |= pushed_and_held(ds, motion.shown[0]) | {"us": microseconds(ds, motion)}
+        figures |= of_velocities(ds, motion) if motion.protocol == HELD_OUT else {}
     return figures | (drawn(ds, motion) if pictured else {})
 
 
@@ -74,7 +76,7 @@ def of_curves(motion: Motion, rollout: Rollout) -> dict[str, float]:
     """Distances of motions from the starts that a protocol asks for.
 
     * ``own``: from each shown start to its demonstration, the mean.
-    * ``beside``: from ``N_BESIDE`` starts in a ball of ``BESIDE`` around the first shown one to that demonstration, the
+    * ``beside``: from ``N_BESIDE`` starts within ``STARTS_WITHIN`` of the first shown one to that demonstration, the
       mean.
     * ``unseen``: from the start of each demonstration that was kept back to that demonstration, the mean.
     * ``arrives``: of the shown starts and those beside, the share from which the motion is within ``ARRIVED`` of the
@@ -87,14 +89,13 @@ def of_curves(motion: Motion, rollout: Rollout) -> dict[str, float]:
     """
     shown, kept_back = motion.shown, () if motion.protocol == IN_SAMPLE else motion.judges
     first = shown[0]
-    ball = unit_ball(N_BESIDE, first.dim, np.random.default_rng(0))
-    beside = first.start + BESIDE * first.size * torch.from_numpy(ball)
+    beside = JUDGED.starts(first)[1:]
     owns = [moved(rollout, one.start.unsqueeze(0), one)[0] for one in shown]
     figures = {
         "own": float(np.mean([distance(path, one) for path, one in zip(owns, shown, strict=True)])),
         "beside": float(np.mean([distance(path, first) for path in moved(rollout, beside, first)])),
         "command": max(fastest(path, one.duration) for path, one in zip(owns, shown, strict=True))
-        / max(fastest(one.at(even_times(one).numpy()), one.duration) for one in shown),
+        / max(fastest(JUDGED.reference(one), one.duration) for one in shown),
     }
     starts = torch.cat([torch.stack([one.start for one in shown]), beside])
     looks = torch.linspace(0, PATIENCE * first.duration, 401, dtype=torch.float64)
@@ -116,17 +117,12 @@ def of_curves(motion: Motion, rollout: Rollout) -> dict[str, float]:
 
 def moved(rollout: Rollout, starts: Tensor, judge: Demonstration) -> Array:
     """Motions at ``N_POINTS`` even times of that demonstration's duration: (B, n) -> (B, N, n)."""
-    return rollout(starts, even_times(judge))
-
-
-def even_times(judge: Demonstration) -> Tensor:
-    return torch.linspace(0, judge.duration, N_POINTS, dtype=torch.float64)
+    return rollout(starts, JUDGED.times(judge))
 
 
 def distance(path: Array, judge: Demonstration) -> float:
-    """From a motion at :func:`even_times`; inf where the motion was lost."""
-    value = metrics.dtw(path, judge.at(even_times(judge).numpy())) / N_POINTS / judge.size
-    return value if np.isfinite(value) else np.inf
+    """From a motion as :func:`moved` gives it; inf where the motion was lost."""
+    return mean_or_inf(np.array([metrics.dtw(path, JUDGED.reference(judge)) / N_POINTS / judge.size]))
 
 
 def fastest(path: Array, duration: float) -> float:
@@ -147,8 +143,7 @@ def their_dtwd(rollout: Rollout, kept_back: Sequence[Demonstration]) -> float:
         speeds = np.linalg.norm(np.diff(path, axis=0), axis=1) / THEIR_STEP
         moving = np.flatnonzero(~(speeds < THEIR_REST))
         sums.append(metrics.dtw(path[: moving[-1] + 2 if len(moving) else 1], one.positions))
-    value = float(np.mean(sums))
-    return value if np.isfinite(value) else np.inf
+    return mean_or_inf(np.array(sums))
 
 
 def path_errors(paths: Sequence[Any], judges: Sequence[Demonstration]) -> dict[str, float]:
@@ -167,12 +162,6 @@ def path_errors(paths: Sequence[Any], judges: Sequence[Demonstration]) -> dict[s
 # --- fields -----------------------------------------------------------------------------------------------------------
 
 
-def of_fields(ds: StableDS, motion: Motion) -> dict[str, float]:
-    """Of protocol C the :func:`of_velocities`; of every protocol ``own_e``, ė at what was shown."""
-    figures = {"own_e": velocity_errors(ds, motion.shown)["e"]}
-    return figures | (of_velocities(ds, motion) if motion.protocol == HELD_OUT else {})
-
-
 def of_velocities(field: Callable[[Tensor], Tensor], motion: Motion) -> dict[str, float]:
     """``test_rmse``, ``test_e``: the :func:`velocity_errors` at the samples that were kept back."""
     return {f"test_{name}": value for name, value in velocity_errors(field, motion.judges).items()}
@@ -189,8 +178,8 @@ def velocity_errors(ds: Callable[[Tensor], Tensor], demonstrations: Sequence[Dem
         torch.cat([d.velocities for d in demonstrations]),
     )
     with torch.no_grad():
-        missed = (ds(positions) - shown).numpy()
-        cosine = velocity_cosine(ds(positions), shown)
+        velocities = ds(positions)
+    missed, cosine = (velocities - shown).numpy(), velocity_cosine(velocities, shown)
     return {"rmse": float(np.sqrt(np.square(missed).mean(axis=1)).mean()), "e": 1 - cosine}
 
 
@@ -211,9 +200,7 @@ def pushed_and_held(ds: StableDS, shown: Demonstration) -> dict[str, float]:
     rest = shown.at((half + times).numpy())
 
     def mean(paths: Tensor) -> float:
-        sums = [metrics.dtw(path.numpy(), rest) for path in paths]
-        value = float(np.mean(sums)) / len(times) / shown.size
-        return value if np.isfinite(value) else np.inf
+        return mean_or_inf(np.array([metrics.dtw(path.numpy(), rest) for path in paths])) / len(times) / shown.size
 
     if isinstance(ds, PhaseDriven):
         pushed = ds.resume(places[:-1], half, half + times)

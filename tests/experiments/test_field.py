@@ -235,10 +235,12 @@ def test_wilcoxon_holds_every_other_against_one():
     draw = np.random.default_rng(0)
     ours = draw.random(12)
     frame = pd.DataFrame({"ours": ours, "same": ours, "worse": ours + draw.random(12) + 0.1, "lost": [math.nan] * 12})
-    p = against(frame, "ours")
+    p = against(frame, "ours")["p"]
     assert p["same"] == 1.0
     assert p["worse"] == pytest.approx(3 * stats.wilcoxon(frame["worse"] - frame["ours"]).pvalue)
     assert p["lost"] < 0.01
+    assert not against(frame, "ours")["better"].any()
+    assert against(frame.drop(columns="same"), "worse")["better"].to_dict() == {"ours": True, "lost": False}
 
 
 # --- what is told -----------------------------------------------------------------------------------------------------
