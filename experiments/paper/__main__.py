@@ -20,7 +20,7 @@ from rich.console import Console
 from experiments import report
 from experiments.compared import recordings
 from experiments.paper.document import Document
-from experiments.paper.framework import framework, left_out
+from experiments.paper.framework import framework
 from experiments.paper.joints import joints
 from experiments.paper.latent_space import latent_space
 from experiments.paper.planes import orbits, planes
@@ -43,7 +43,6 @@ SECTIONS: dict[str, Callable[[Study, Document], None]] = {
     "Table II: SDS-EF": table_two,
     "Replications": replications,
     "DMP's forward orbits": orbits,
-    "What is left out": left_out,
 }
 
 

@@ -15,7 +15,8 @@ from latentds.plotting import SHOWN
 
 SIMILAR = 3.0
 """Factor within which a measured figure counts as reproduced."""
-NO_NUMBERS = "not reproducible: no numbers to compare with"
+UNKNOWN = "not reproducible"
+NO_NUMBERS = f"{UNKNOWN}: no numbers to compare with"
 REPRODUCED, IN_PART, CONTRADICTED = "reproduced", "reproduced in part", "contradicted"
 DPI = 100
 GOAL: dict[str, Any] = {"marker": "*", "color": "#E69F00", "mec": SHOWN, "mew": 0.6, "ms": 12, "ls": ""}
@@ -71,6 +72,20 @@ class Document:
         figure.savefig(self.pictures / f"{name}.png", dpi=DPI)
         self.add(f"![{caption}]({self.pictures.parent.name}/{self.pictures.name}/{name}.png)\n\n*{caption}*")
 
+    def verdict(self) -> str:
+        """How many of the findings are what, in three sentences."""
+        kinds = {
+            kind: [f.what for f in self.findings if f.verdict.startswith(kind)]
+            for kind in (REPRODUCED, CONTRADICTED, UNKNOWN)
+        }
+        held = len(kinds[REPRODUCED]) - sum(f.verdict == IN_PART for f in self.findings)
+        others = len(self.findings) - held - len(kinds[CONTRADICTED]) - len(kinds[UNKNOWN])
+        return (
+            f"Of {len(self.findings)} things that the paper shows, {held} are reproduced, and {others} in part, better,"
+            f" worse, or as one reads it. Contradicted: {'; '.join(kinds[CONTRADICTED]) or 'nothing'}. Without numbers "
+            f"or recordings to compare with: {'; '.join(kinds[UNKNOWN]) or 'nothing'}."
+        )
+
     def text(self, quick: bool, recorded: bool, seconds: float) -> str:
         """The whole of it; ``recorded``: joint motions came from files."""
         where = report.environment()
@@ -89,7 +104,8 @@ class Document:
             "The paper is Gupta, Nayak and Billard, *Learning High Dimensional Demonstrations Using Laplacian "
             f"Eigenmaps*. A figure counts as *reproduced* within a factor {SIMILAR:g} of the paper's, beyond it as "
             "*better* or *worse*. Where the paper is silent, our readings are in [corrections](corrections.md).",
-            "## Summary",
+            "## Verdict",
+            self.verdict(),
             report.table(["what", "paper", "ours", "verdict"], self.findings),
             *self.parts,
             "",

@@ -1,4 +1,4 @@
-"""The paper's picture of its framework, from a demonstration to the mapped points, and what the report leaves out."""
+"""The paper's picture of its framework, from a demonstration to the mapped points; what cannot be compared is told."""
 
 from __future__ import annotations
 
@@ -23,14 +23,10 @@ def framework(_: Study, document: Document) -> None:
     ds = greedy("Chebyshev", TABLE_ONE["Chebyshev"][shown.name])(3).fit(shown)
     caption = "The paper's framework: from a demonstration to the mapped points"
     document.show("framework", draw_framework(shown, ds), caption)
-
-
-def left_out(_: Study, document: Document) -> None:
     missing = {
         "Light paintings, robot runs": "needs the robot; the motions are the same systems as above",
         "End-effector paths of the kinesthetic cases": "the recordings are not public",
     }
-    document.table(["what", "why"], missing.items())
     for what, why in missing.items():
         document.find(what, "figure", "—", f"not reproducible: {why}")
 

@@ -42,12 +42,9 @@ def latent_space(_: Study, document: Document) -> None:
     claims = ("monotone", "spacing grows", "λ / bound", "λN² / (π²/4)")
     document.table(["n", *(f"k of {name}" for name in names), *claims], lines)
     document.add(
-        f"Eigenvalues of the explicit Laplacian of {PATH_NODES} nodes a path, K = n+1. Proposition 2's Λ counts "
-        "pairs of equal blocks; each pair repeats one eigenvalue per node."
+        f"The summary's eigenvalues are of the explicit Laplacian of {PATH_NODES} nodes a path, K = n+1 = 3 … 8. "
+        "Proposition 2's Λ counts pairs of equal blocks; each pair repeats one eigenvalue per node."
     )
-    header = ["n", "K", "Λ, paper", "distinct eigenvalues of multiplicity 2", "per node"]
-    rows = [[f"{value:g}" for value in row] for row in eigenvalues.itertuples(index=False)]
-    document.table([*header, "repeated among the n smallest > 0"], rows)
     entry, norm = (exponents[key].values() for key in ("entry", "norm"))
     even, odd = (eigenvalues[eigenvalues["n"] % 2 == parity] for parity in (0, 1))
     repeated, counted = "of the n smallest", bool((eigenvalues["per node"] == eigenvalues["paper"]).all())

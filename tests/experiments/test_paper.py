@@ -160,7 +160,8 @@ def test_a_run_writes_a_report_and_goes_on_where_it_stopped(tmp_path, monkeypatc
     reproduce(TINY, tmp_path, tmp_path / "docs" / "reproduction.md", 1)
     written = (tmp_path / "docs" / "reproduction.md").read_text()
     assert "A quick run" in written
-    summary = written.split("## Summary")[1].split("##")[0]
+    verdict, summary = written.split("## Verdict\n\n")[1].split("\n\n## ")[0].split("\n\n")
+    assert "Contradicted: Prop. 5" in verdict
     assert "contradicted: O(1/N)" in summary
     assert "contradicted for odd n" in summary
     assert all(line.count("|") == 5 for line in summary.strip().splitlines())

@@ -75,8 +75,10 @@ def test_fast_dtw_that_differs_is_marked():
     rows = made_up(lambda m, d, s: 10.0 + 1e-3 * s)
     rows.loc[(rows["method"] == "FDM") & (rows["demonstration"] == "unstable c=3"), "dtw_fast"] = 10.6
     rows.loc[(rows["method"] == "FDM") & (rows["demonstration"] == "unstable c=7"), "dtw_fast"] = 10.4
-    assert "10.60 ± 0.00 †" in line(summary_of(rows), "FastDTW (radius 1)", "unstable c=3")
-    assert "†" not in line(summary_of(rows), "FastDTW (radius 1)", "unstable c=7")
+    summary = summary_of(rows)
+    assert "**10.00 ± 0.00** †" in line(summary, "exact DTW over", "unstable c=3")
+    assert "†" not in line(summary, "exact DTW over", "unstable c=7")
+    assert "differs by at most 6.0%: FDM at unstable c=3." in summary
 
 
 def test_the_papers_mse_stands_beside_ours():
