@@ -7,13 +7,15 @@ from pathlib import Path
 
 import latentds
 
-sys.path.insert(0, str(Path(__file__).parent))  # for the scraper
+sys.path.insert(0, str(Path(__file__).parent))  # for what this folder adds to Sphinx
 
 project, author, release = "latentds", "the latentds authors", latentds.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_gallery.gen_gallery"]
+extensions += ["linked_terms", "offline_formulas"]
 exclude_patterns = ["_build", "gallery/*", "**/*.ipynb"]
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = "latentds"
 autodoc_member_order = "bysource"

@@ -325,41 +325,6 @@ def sdsef_step(rounds: int) -> list[Goal]:
         return [race(what, 6, partial(step, inverted), partial(step, back_sweep), rounds)]
 
 
-BEFORE = {
-    "TubeDS(3) fit, unstable c = 3": 6.28e9,
-    "TubeDS(3) fit, unstable c = 7": 6.96e9,
-    "TubeDS(3) fit, stable c = 5": 7.15e9,
-    "SDS-EF, velocity of one point": 3.23e6,
-    "SDS-EF, rollout 1 x 200": 5.54e7,
-    "SDS-EF, rollout 16 x 200": 2.57e9,
-}
-"""What calls took at revision 5f85714, in exponentials of the floor: medians of five processes of that revision that
-took turns with five of c524d5e, one thread, CPU time, on 28 November 2026 (Xeon with AVX-512, 0.40 ns an exponential).
-
-That revision is not at hand where this runs; an exponential is a yardstick that goes along. It is a rough one, by a
-third or so: torch's own operations and the memory need not grow with the width of the registers.
-"""
-
-
-def against_before(rounds: int) -> list[Goal]:
-    """Today's calls against those of revision 5f85714, and SDS-EF's velocity against the clock."""
-    flow = SDSEF(3, seed=0, epochs=2).fit(SHOWN)
-    start, times = SHOWN.start, torch.linspace(0, SHOWN.duration, 200, dtype=torch.float64)
-    spirals = (datasets.unstable_spiral(3), SHOWN, datasets.stable_spiral(5))
-    calls: list[tuple[float, Callable[[], Any]]] = [
-        *((3, partial(TubeDS(3).fit, shown)) for shown in spirals),
-        (5, partial(flow, SHOWN.positions[400])),
-        (5, partial(flow.rollout, start, times)),
-        (5, partial(flow.rollout, start.expand(16, 3), times)),
-    ]
-    goals = [one_point("SDS-EF, L = 10, F = 200, ds(y) of one point", flow, rounds)]
-    for (what, before), (least, call) in zip(BEFORE.items(), calls, strict=True):
-        clock = take_turns({"now": call, "exponentials": partial(exponentials, BUFFER, REPEATS)}, max(1, rounds // 8))
-        then = before * clock["exponentials"] / REPEATS / BLOCK
-        goals.append(report.ratio(f"{what}, 5f85714 as recorded", least, then, clock["now"]))
-    return goals
-
-
 def one_point(what: str, ds: LatentDS, rounds: int) -> Goal:
     times = take_turns({"ds(y)": partial(ds, SHOWN.positions[400])}, rounds)
     return report.median(what, "µs", 60, 1e6 * times["ds(y)"], at_most=True)
@@ -448,7 +413,7 @@ def main(
         *against_floor(ds, rounds),
         *against_loop(ds, rounds),
         one_point(f"ds(y) of one point, M = {N_LAYERS}", ds, rounds),
-        *against_before(rounds),
+        one_point("SDS-EF, L = 10, F = 200, ds(y) of one point", SDSEF(3, seed=0, epochs=2).fit(SHOWN), rounds),
         *control_loop(2000 if quick else 20_000),
         *rollouts(ds, rounds),
         *gradients(rounds),

@@ -175,7 +175,7 @@ def test_a_run_writes_a_report_and_goes_on_where_it_stopped(tmp_path, monkeypatc
     monkeypatch.setattr("joblib.delayed", again)  # of the benchmark itself, a change would count
     reproduce(TINY, tmp_path, tmp_path / "docs" / "reproduction.md", 1)
     told = (tmp_path / "docs" / "reproduction.md").read_text()
-    assert told.split("## Summary")[1] == written.split("## Summary")[1]
+    assert told.split("## Verdict")[1] == written.split("## Verdict")[1]
 
 
 def test_recordings_that_are_none_are_refused_before_any_work(tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 
-import numpy as np
 import pandas as pd
 import pytest
 import torch
@@ -34,18 +33,6 @@ def test_exponents_of_a_power_law():
     (row,) = speed.exponents(curves).itertuples(index=False)
     assert row[:4] == ("N", "fit", 200, 1600)
     assert row.exponent == pytest.approx(1.5)
-
-
-def test_recorded_calls_are_paid_in_exponentials(monkeypatch):
-    """Where an exponential takes 1 ns and every call 10 ms, the ratio is the record's."""
-    a_loop = 1e-9 * speed.REPEATS * speed.BLOCK
-
-    def constant(rivals, rounds):
-        return {name: np.full(rounds, a_loop if name == "exponentials" else 0.01) for name in rivals}
-
-    monkeypatch.setattr(speed, "take_turns", constant)
-    _, *goals = speed.against_before(9)
-    assert [float(goal.reached) for goal in goals] == pytest.approx([b / 1e7 for b in speed.BEFORE.values()], rel=0.01)
 
 
 def test_without_zuko_a_sentence_says_so_and_torch_func_is_raced(ds, monkeypatch, capsys):
