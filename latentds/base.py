@@ -252,6 +252,14 @@ class StableDS(nn.Module, ABC):
     def forward(self, y: Tensor) -> Tensor:
         """Velocity at ``y``: (..., n) -> (..., n), units of y per second."""
 
+    def straight_velocity(self, y: Tensor) -> Tensor:
+        """ẏ of the straight latent motions through ``y``, which nothing draws to a path: (..., n) -> (..., n).
+
+        Of a system without latent space, and of one whose latent motions are straight, its own velocity.
+        """
+        velocity: Tensor = self(y)
+        return velocity
+
     @abstractmethod
     def lyapunov(self, y: Tensor) -> Tensor:
         """V(y) >= 0, zero only at the attractor, decreasing along every motion: (..., n) -> (...)."""
@@ -647,6 +655,11 @@ class LatentDS(StableDS):
         exact = copy.deepcopy(self).to("cpu", torch.float64)
         return field_tables(exact.diffeomorphism, exact.dynamics, exact.frame())
 
+    def straight_velocity(self, y: Tensor) -> Tensor:
+        points, wanted = self._points(y)
+        x, push, frame = self._linearize(points)
+        return push(self.dynamics.straight()(x, points, frame)).to(wanted)
+
     @eager_for_derivatives
     def forward(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
@@ -730,6 +743,10 @@ class MovedDS(StableDS):
     def forward(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
         return self.similarity.velocity(self.ds(self._inside(points))).to(wanted)
+
+    def straight_velocity(self, y: Tensor) -> Tensor:
+        points, wanted = self._points(y)
+        return self.similarity.velocity(self.ds.straight_velocity(self._inside(points))).to(wanted)
 
     def lyapunov(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)

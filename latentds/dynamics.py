@@ -45,6 +45,10 @@ class LatentDynamics(Tabulated, nn.Module, ABC):
     def flow(self, x: Tensor, t: Tensor, frame: Frame) -> Tensor:
         """States at times ``t`` (T,), seconds since x: (..., n) -> (..., T, n)."""
 
+    def straight(self) -> LatentDynamics:
+        """Dynamics as fast along the line whose motions are straight; itself, if they are."""
+        return self
+
     def lyapunov(self, x: Tensor, frame: Frame) -> Tensor:
         """V = ‖x - x*‖²: (..., n) -> (...)."""
         return (x - frame.attractor).square().sum(-1)
@@ -122,6 +126,9 @@ class TubeDynamics(LatentDynamics):
         reach = radius / length
         along, across = (law.convergence_rate_bound(reach) for law in (self.law, self.transverse_law))
         return None if along is None or across is None else min(along, across)
+
+    def straight(self) -> LatentDynamics:
+        return RayDynamics(self.law)
 
     def phase(self, x: Tensor, frame: Frame) -> Tensor:
         """s, 1 at the demonstrated start and 0 at x*: (..., n) -> (...)."""

@@ -58,6 +58,12 @@ class FieldTables(NamedTuple):
     def packed(self) -> tuple[Array, Array, Array, Array]:
         return self.layers, self.goal, self.along.packed(), self.across.packed()
 
+    def straight(self) -> FieldTables:
+        """Those of straight latent motions: all of the offset shrinks as it does along the axis."""
+        goal = self.goal.copy()
+        goal[1] = 0
+        return self._replace(goal=goal, across=self.along)
+
     def kernel(self, tangents: int) -> Kernel:
         function: Kernel = velocity_kernel(self.goal.shape[1], tangents)
         return function
