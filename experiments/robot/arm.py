@@ -132,6 +132,12 @@ class Arm:
         self._place(_shaped(q, "q", 7))
         return self._pose()
 
+    def links(self, q: Array) -> Array:
+        """(9, 3) m, from the foot by the seven joints to the tool: the arm as a line, for pictures."""
+        self._place(_shaped(q, "q", 7))
+        places: Array = np.vstack([np.zeros(3), self.data.xpos[-7:], self._pose()[0]])
+        return places
+
     def jacobian(self, q: Array) -> Array:
         """(6, 7): the tool's velocity, m/s, and below its turning, rad/s in the frame of the base, per rad/s."""
         self._place(_shaped(q, "q", 7))
