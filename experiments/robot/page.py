@@ -36,8 +36,8 @@ from latentds.arguments import Array
 from latentds.files import atomic_write
 from latentds.plotting import color_of
 
-VIEW = np.array([[0.5, 0.866, 0.0], [-0.26, 0.15, 0.954]])
-"""Right and up of the pictures, in the frame of the base: from the front, a little from above and from the side."""
+VIEW = np.array([[0.5, 0.866, 0.0], [-0.612, 0.354, 0.707]])
+"""Right and up of the pictures, in the frame of the base: from the front, half from above and from the side."""
 FRAMES, FRAME_MS, GIF_COLORS = 60, 80, 64
 SHOWN_LIGHT = "#9BD1FF"
 
@@ -256,7 +256,7 @@ def animate(path: Path, kept: Any) -> None:
         ax.set_axis_off()
         ax.plot(*(VIEW @ arm.links(angles[k]).T), "-o", color="#888888", lw=6, ms=7, solid_capstyle="round")
         light(ax, tool[: k + 1], color_of("TubeDS"), 1.0)
-        ax.set(xlim=(-0.35, 0.75), ylim=(-0.1, 1.0))
+        ax.set(xlim=(-0.45, 0.75), ylim=(-0.5, 0.7))
         with io.BytesIO() as file:
             figure.savefig(file, dpi=80, facecolor="black", format="png")
             frames.append(Image.open(file).convert("RGB").quantize(GIF_COLORS))
