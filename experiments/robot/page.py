@@ -6,6 +6,7 @@ import io
 import json
 import math
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,7 @@ def document(rows: pd.DataFrame, every: Sequence[Demonstration], pictures: Seque
     parts += [
         "## How it was measured",
         f"{TOLD_ARM} Revision {where['revision']}, {where['date'][:10]}, {where['cores']} cores of {where['cpu']}, "
-        f"MuJoCo {where['packages'].get('mujoco', '')}.",
+        f"MuJoCo {version('mujoco')}.",
     ]
     return "\n\n".join(parts) + "\n"
 
@@ -149,9 +150,14 @@ def verdict(rows: pd.DataFrame) -> str:
 
 
 def table(rows: pd.DataFrame, columns: dict[str, tuple[str, str]]) -> str:
-    header = ["motion", "method", *(title for title, _ in columns.values())]
+    header = ["motion", "method", "follows", *(title for title, _ in columns.values())]
     lines = [
-        [row["motion"], row["method"], *(_told(row[key], form) for key, (_, form) in columns.items())]
+        [
+            row["motion"],
+            row["method"],
+            "yes" if row["follows"] else "**no**",
+            *(_told(row[key], form) for key, (_, form) in columns.items()),
+        ]
         for row in rows.to_dict("records")
     ]
     return report.table(header, lines)

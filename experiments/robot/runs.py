@@ -20,7 +20,7 @@ from latentds.deploy.passive import PassiveController
 from latentds.modulation import AvoidingDS, sphere
 
 DT = 1e-3
-ALONG, ACROSS = 250.0, 400.0
+ALONG, ACROSS = 1000.0, 1500.0
 """N s/m, damping of the tool along its motion and across it."""
 ENERGY, STRONGEST = 4.0, 120.0
 """J that the passive controller may give beyond what it gets back, and N of its force."""
@@ -56,6 +56,8 @@ def measured(ds: StableDS, cell: Cell) -> dict[str, Any]:
 class PassiveTool:
     """Torques of a passive controller of the tool's position, its orientation held ``DOWN``: g(q) + Jᵀ (F, moment).
 
+    The joints' friction is made up for, as the arm's own torque control does; else it would drain the tank.
+
     Attributes:
         passive: of the position.
         x, velocity: (3,) of the tool, as of the last call.
@@ -79,7 +81,9 @@ class PassiveTool:
         moment = TURN * Rotation.from_matrix(DOWN @ rotation.T).as_rotvec() - TURN_DAMPING * moving[3:]
         aside = ELBOW * (HOME - q) - ELBOW_DAMPING * v
         aside -= slopes.T @ np.linalg.solve(slopes @ slopes.T, slopes @ aside)
-        torque: Array = self.arm.bias(q, np.zeros(7)) + slopes.T @ np.concatenate([force, moment]) + aside
+        torque: Array = (
+            self.arm.bias(q, np.zeros(7)) + self.arm.DAMPING * v + slopes.T @ np.concatenate([force, moment]) + aside
+        )
         return torque
 
 
