@@ -12,7 +12,7 @@ ROOT = Path(__file__).parent.parent
 ROOMS = (
     "arguments", "curves", "resizing", "tabulated", "memo", "files", "recordings", "findings", "demonstration",
     "datasets", "kernels", "time_law", "diffeomorphism", "translations", "transform", "dynamics", "deploy",
-    "integrate", "metrics", "probes", "fidelity", "fitting", "similarity", "base", "modulation", "methods",
+    "integrate", "metrics", "probes", "fidelity", "fitting", "similarity", "base", "modulation", "poses", "methods",
     "storage", "cache", "certificate", "testing", "cell", "benchmark", "plotting", "report", "cli", "__main__",
 )  # fmt: skip
 """Of latentds; each may import itself and those before it."""
