@@ -345,7 +345,6 @@ def cost_table(first: pd.DataFrame) -> pd.DataFrame:
     table = pd.DataFrame(
         {
             "fit [s]": of["fit_seconds"].median().map("{:.2g}".format),
-            "longest [s]": of["fit_seconds"].max().map("{:.2g}".format),
             "a velocity [µs]": of["us"].median().map("{:.0f}".format),
             "numbers": of["n_parameters"].median().map("{:.0f}".format),
             "arrival, median": of["arrival"].median().map("{:.3g}".format),
