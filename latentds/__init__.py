@@ -10,12 +10,16 @@ from .fidelity import FitWarning
 from .kernels import warmup
 from .methods.chebyshev import ChebyshevDS
 from .methods.tube import TubeDS
+from .modulation import AvoidingDS, BoundedDS
+from .poses import PoseDemonstration, PoseDS
 from .storage import load
 from .transform import as_transform
 from .translations import LocallyWeightedTranslations
 
 __version__ = "0.1.0"  # the one place
 __all__ = [
+    "AvoidingDS",
+    "BoundedDS",
     "Certificate",
     "ChebyshevDS",
     "Demonstration",
@@ -25,6 +29,8 @@ __all__ = [
     "LatentDS",
     "Learned",
     "LocallyWeightedTranslations",
+    "PoseDS",
+    "PoseDemonstration",
     "StableDS",
     "TubeDS",
     "as_transform",

@@ -93,6 +93,28 @@ class PoseDemonstration:
         }.items():
             object.__setattr__(self, name, value)
 
+    @classmethod
+    def of(cls, recording: Demonstration, length: float | None = None) -> PoseDemonstration:
+        """A recording, as :meth:`Demonstration.load` reads it, of three positions and a quaternion with columns' names.
+
+        The quaternion's columns are those four beside each other whose names end in x, y, z and w.
+
+        Raises:
+            ValueError: if there are other columns, or none so named.
+        """
+        last = ["".join(filter(str.isalpha, name.lower()))[-1:] for name in recording.columns]
+        for first in range(len(last) - 3):
+            four = last[first : first + 4]
+            if len(last) == 7 and sorted(four) == list("wxyz"):
+                columns = [first + four.index(letter) for letter in "wxyz"]
+                rows = recording.positions.numpy()
+                others = [k for k in range(7) if k not in columns]
+                return cls(rows[:, others], rows[:, columns], recording.dt, length, recording.name)
+        raise ValueError(
+            "recording: expected seven columns, of which four beside each other end in x, y, z, w, got "
+            f"{recording.columns}"
+        )
+
     def in_chart(self, orientation: Array, length: float) -> Demonstration:
         """The motion in the chart of a goal's ``orientation`` (4,) with that ``length``: in 6-D."""
         poses = np.concatenate([self.positions, self.quaternions], axis=1)

@@ -11,7 +11,7 @@ import torch
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from latentds import ChebyshevDS, TubeDS
+from latentds import ChebyshevDS, Demonstration, TubeDS
 from latentds.poses import PoseDemonstration, PoseDS
 
 
@@ -181,6 +181,20 @@ def test_it_is_a_module_of_torch(pose):
     for other in (again, copy.deepcopy(pose), pickle.loads(pickle.dumps(pose))):
         torch.testing.assert_close(other(where), pose(where))
     assert copy.deepcopy(pose).float()(where.float()).dtype == torch.float32
+
+
+@pytest.mark.parametrize("names", [("px", "py", "pz", "qx", "qy", "qz", "qw"), ("qw", "qx", "qy", "qz", "x", "y", "z")])
+def test_a_recording_is_read_by_its_columns_names(shown, names, tmp_path):
+    order = ["px", "py", "pz", "qw", "qx", "qy", "qz"]
+    known = {name[-2:] if "q" in name else "p" + name[-1]: k for k, name in enumerate(order)}
+    rows = poses_of(shown)[:, [known[name if "q" in name else "p" + name[-1]] for name in names]]
+    table = np.column_stack([shown.dt * np.arange(len(rows)), rows.numpy()])
+    np.savetxt(tmp_path / "hand.csv", table, delimiter=",", header=",".join(("time", *names)), comments="")
+    read = PoseDemonstration.of(Demonstration.load(tmp_path / "hand.csv"))
+    np.testing.assert_allclose(read.positions, shown.positions, atol=1e-6)
+    np.testing.assert_allclose(np.abs((read.quaternions * shown.quaternions).sum(1)), 1, atol=1e-9)
+    with pytest.raises(ValueError, match="recording: expected seven columns"):
+        PoseDemonstration.of(Demonstration(rows, shown.dt))
 
 
 def test_several_are_learned_with_the_mean_of_their_goals():

@@ -1,4 +1,4 @@
-"""The paper's picture of its framework, from a demonstration to the mapped points; what cannot be compared is told."""
+"""The paper's picture of its framework, from a demonstration to the mapped points; what has no numbers is told."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
 
 from experiments.compared import greedy
-from experiments.paper.document import DPI, GOAL, Document
+from experiments.paper.document import DPI, GOAL, NO_NUMBERS, Document
 from experiments.paper.study import Study
 from experiments.published import TABLE_ONE
 from latentds import ChebyshevDS, Demonstration, LatentDS, datasets
@@ -23,12 +23,9 @@ def framework(_: Study, document: Document) -> None:
     ds = greedy("Chebyshev", TABLE_ONE["Chebyshev"][shown.name])(3).fit(shown)
     caption = "The paper's framework: from a demonstration to the mapped points"
     document.show("framework", draw_framework(shown, ds), caption)
-    missing = {
-        "Light paintings, robot runs": "needs the robot; the motions are the same systems as above",
-        "End-effector paths of the kinesthetic cases": "the recordings are not public",
-    }
-    for what, why in missing.items():
-        document.find(what, "figure", "—", f"not reproducible: {why}")
+    simulated = "drawn [on a simulated arm](robot.md), with made-up kinesthetic motions"
+    for what in ("Light paintings, robot runs", "End-effector paths of the kinesthetic cases"):
+        document.find(what, "figure", simulated, NO_NUMBERS)
 
 
 def draw_framework(shown: Demonstration, ds: LatentDS, n_nodes: int = 12) -> Figure:
