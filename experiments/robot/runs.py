@@ -148,8 +148,12 @@ def of_tool(ds: StableDS, shown: Demonstration) -> dict[str, Any]:
 def of_joints(ds: StableDS, shown: Demonstration) -> dict[str, Any]:
     """Two runs of a system of seven joint angles, by computed torque: undisturbed, and pushed at the tool."""
     arm, curve, goal = Arm(), shown.positions.numpy(), shown.goal.numpy()
-    if not ((curve > Arm.LOWER) & (curve < Arm.UPPER)).all():
-        raise ValueError(f"data: expected angles within the arm's limits, rad, got {shown.name} beyond them")
+    if (beyond := np.abs(curve).max(0) / Arm.UPPER).max() >= 1:
+        worst = int(beyond.argmax())
+        raise ValueError(
+            f"data: expected angles within the arm's limits, rad, got {shown.name} with joint {worst + 1} at "
+            f"{np.abs(curve[:, worst]).max():.2f}, beyond {Arm.UPPER[worst]:.2f}"
+        )
     half, drawn = 0.5 * shown.duration, np.array([arm.forward(q)[0] for q in curve])
     follow = FollowJoints(arm, ds.controller(), dt=DT)
     free = simulate(arm, curve[0], follow, PATIENCE * shown.duration, None, DT)

@@ -83,7 +83,7 @@ def test_scores_do_not_count_where_a_robot_waits():
 def test_recordings_beyond_the_limits_are_refused(shown):
     wide = replace(kinesthetic(Arm(), 0, n_points=40), name="mine")
     wide = replace(wide, positions=wide.positions * 10)
-    with pytest.raises(ValueError, match="data: expected angles within the arm's limits, rad, got mine"):
+    with pytest.raises(ValueError, match="data: expected angles within the arm's limits, rad, got mine with joint"):
         runs.of_joints(TubeDS(7), wide)
 
 
