@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from .arguments import Array, number_in, positive, real_array, whole_number
-from .base import Learned, StableDS
+from .base import Learned, MovedDS, StableDS
 from .demonstration import Demonstration
 from .deploy.controller import Controller
 from .deploy.tables import Compiled, FieldTables
@@ -112,7 +112,35 @@ def box(center: Any, half_sizes: Any, **motion: Any) -> Obstacle:
     return Obstacle(center, bulge * sizes, exponent=BOX_EXPONENT, **motion)
 
 
-class AvoidingDS(StableDS):
+class _Modulated(StableDS):
+    """A system made of another, in whose place it stands: the motion inside moves along with its attractor."""
+
+    def __init__(self, ds: StableDS) -> None:
+        super().__init__(ds.dim)
+        self.ds = ds
+        self.to(ds.attractor)
+        with torch.no_grad():
+            self.attractor.copy_(ds.attractor)
+
+    def _learn(self, shown: Sequence[Demonstration], progress: bool) -> Learned:
+        raise ValueError("fit: expected the system inside; fit ds.ds, and wrap it again")
+
+    def _moved(self, attractor: Tensor, **change: Any) -> MovedDS:
+        raise ValueError(
+            f"{type(self).__name__}: expected the system inside, as what stands around does not move with a motion; "
+            "move or slow ds.ds, and wrap it again"
+        )
+
+    def lyapunov(self, y: Tensor) -> Tensor:
+        """V of the system inside, which may rise here."""
+        points, wanted = self._points(y)
+        return self.ds.lyapunov(self._inside(points)).to(wanted)
+
+    def _inside(self, points: Tensor) -> Tensor:
+        return points - (self.attractor - self.ds.attractor)
+
+
+class AvoidingDS(_Modulated):
     """A system that goes around convex obstacles, after Khansari-Zadeh and Billard (2012) and Huber et al. (2019).
 
     At Γ ≥ 1 from an obstacle, with r the direction from its centre, n its normal and w = 1/Γ², the velocity is split
@@ -125,9 +153,9 @@ class AvoidingDS(StableDS):
     hold the robot where the path meets the surface; straight motions part there, at a saddle point.
 
     What it promises: no motion enters an obstacle; the goal is kept; where the system inside has no other equilibrium,
-    neither has this one but on surfaces, where n and the velocity are parallel. For a straight field and one obstacle
-    that is a saddle point, which all motions but those of measure zero pass (Huber et al., theorem 2); for curved ones
-    and for several obstacles it is not proven. A motion that begins inside is led out.
+    neither has this one but on surfaces, where the velocity runs along r. For a straight field and one obstacle that is
+    a saddle point, which all motions but those of measure zero pass (Huber et al.); for curved ones and for several
+    obstacles it is not proven. A motion that begins inside is led out.
 
     Args:
         ds: any stable system.
@@ -143,32 +171,22 @@ class AvoidingDS(StableDS):
     """
 
     def __init__(self, ds: StableDS, obstacles: Sequence[Obstacle], margin: float = 0.0) -> None:
-        super().__init__(ds.dim)
+        super().__init__(ds)
         if not obstacles or not all(isinstance(one, Obstacle) and len(one.center) == ds.dim for one in obstacles):
             raise ValueError(f"obstacles: expected at least one Obstacle in {ds.dim}-D, got {obstacles!r:.80}")
-        self.ds = ds
         self.margin = margin
         grown = [one.grown(margin) for one in obstacles]
         for one in grown:
             if not float(one.level(ds.attractor.detach().double().cpu())) > 1:
                 raise ValueError(f"obstacles: expected none at the goal, got one around {one.center.tolist()}")
-        self.obstacles = nn.ModuleList(grown)
-        self.to(ds.attractor)
-        with torch.no_grad():
-            self.attractor.copy_(ds.attractor)
-
-    def _learn(self, shown: Sequence[Demonstration], progress: bool) -> Learned:
-        raise ValueError("fit: expected a system without obstacles; fit the one inside, ds.ds, and wrap it again")
+        self.obstacles = nn.ModuleList(grown).to(ds.attractor)
 
     def forward(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
         bodies = [one.body() for one in self.obstacles if isinstance(one, Obstacle)]
-        velocity: Tensor = _around(torch, points, self.ds(points), self.ds.straight_velocity(points), bodies)
+        inside = self._inside(points)
+        velocity: Tensor = _around(torch, points, self.ds(inside), self.ds.straight_velocity(inside), bodies)
         return velocity.to(wanted)
-
-    def lyapunov(self, y: Tensor) -> Tensor:
-        """V of the system inside, which on the way around an obstacle may rise."""
-        return self.ds.lyapunov(y)
 
     def controller(self, *, max_speed: float = math.inf) -> AvoidingController:  # type: ignore[override]
         """For a control loop: see :class:`AvoidingController`."""
@@ -189,6 +207,7 @@ class AvoidingController:
         self.dim = ds.dim
         self.max_speed = number_in(max_speed, "max_speed", 0, math.inf, ends="(]")
         self.field, self._straight = own.ds.controller(), Controller(_Straight(own.ds))
+        self.field.goal = own.attractor.numpy()
         self.obstacles = [one.numbers() for one in own.obstacles if isinstance(one, Obstacle)]
 
     def __call__(self, y: Any, out: Array | None = None) -> Array:
@@ -205,7 +224,7 @@ class AvoidingController:
         return out
 
 
-class BoundedDS(StableDS):
+class BoundedDS(_Modulated):
     """A system that stays within limits, such as those of an arm's joints: no motion leaves {lower ≤ y ≤ upper}.
 
     Toward a wall that is d away a coordinate's velocity is multiplied by min(1, d / margin); other coordinates, and
@@ -225,8 +244,7 @@ class BoundedDS(StableDS):
     upper: Tensor
 
     def __init__(self, ds: StableDS, lower: Any, upper: Any, margin: float) -> None:
-        super().__init__(ds.dim)
-        self.ds = ds
+        super().__init__(ds)
         self.margin = positive(margin, "margin")
         for name, value in {"lower": lower, "upper": upper}.items():
             limit = _finite(value, name)
@@ -240,43 +258,22 @@ class BoundedDS(StableDS):
                 f"{self.margin:g}, got {self.lower.tolist()} and {self.upper.tolist()}"
             )
         self.to(ds.attractor)
-        with torch.no_grad():
-            self.attractor.copy_(ds.attractor)
-
-    def _learn(self, shown: Sequence[Demonstration], progress: bool) -> Learned:
-        raise ValueError("fit: expected a system without limits; fit the one inside, ds.ds, and wrap it again")
 
     def forward(self, y: Tensor) -> Tensor:
         points, wanted = self._points(y)
+        inside = self._inside(points)
         below, above = ((wall / self.margin).clamp(0, 1) for wall in (points - self.lower, self.upper - points))
-        own, nearest = self.ds(points), 1 - torch.minimum(below, above).amin(-1, keepdim=True)
-        velocity: Tensor = own + nearest * (self.ds.straight_velocity(points) - own)
+        own, nearest = self.ds(inside), 1 - torch.minimum(below, above).amin(-1, keepdim=True)
+        velocity: Tensor = own + nearest * (self.ds.straight_velocity(inside) - own)
         room = torch.where(velocity < 0, below, above)
         return (velocity * room).to(wanted)
 
-    def lyapunov(self, y: Tensor) -> Tensor:
-        """V of the system inside, which along a wall may rise."""
-        return self.ds.lyapunov(y)
 
-
-class _Straight(StableDS):
+class _Straight(_Modulated):
     """The straight latent motions of a system, as one of their own."""
-
-    def __init__(self, ds: StableDS) -> None:
-        super().__init__(ds.dim)
-        self.ds = ds
-        self.to(ds.attractor)
-        with torch.no_grad():
-            self.attractor.copy_(ds.attractor)
-
-    def _learn(self, shown: Sequence[Demonstration], progress: bool) -> Learned:
-        raise NotImplementedError
 
     def forward(self, y: Tensor) -> Tensor:
         return self.ds.straight_velocity(y)
-
-    def lyapunov(self, y: Tensor) -> Tensor:
-        return self.ds.lyapunov(y)
 
     def tables(self) -> Compiled | None:
         inside = self.ds.tables()

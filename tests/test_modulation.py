@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from latentds import ChebyshevDS, TubeDS, datasets
+from latentds.deploy.tables import FieldTables
 from latentds.modulation import AvoidingDS, BoundedDS, Obstacle, box, sphere
 
 WAVE = datasets.drawn("wave", n_points=200)
@@ -28,20 +29,32 @@ def starts_around(shown, count, spread=0.1, seed=0):
     return torch.cat([shown.start[None], shown.start + spread * shown.size * noise])
 
 
+def driven(ds, starts, durations=4.0, steps=4000):
+    """(steps, ..., n) by small steps of the controller, much faster than by the module's adaptive ones."""
+    controller, y, path = ds.controller(), starts.numpy().copy(), []
+    for _ in range(steps):
+        y = y + durations * WAVE.duration / steps * controller(y)
+        path.append(y)
+    return torch.from_numpy(np.array(path))
+
+
 @pytest.mark.parametrize("radius", [0.06, 0.15])
 def test_motions_around_a_ball_on_the_path_do_not_enter_it_and_arrive(tube, radius):
     ds = AvoidingDS(tube, [sphere(WAVE.positions[90], radius * WAVE.size)])
-    path = ds.rollout(starts_around(WAVE, 3), times(WAVE))
-    assert float(ds.obstacles[0].level(path).min()) > 0.999
-    assert float((path[:, -1] - WAVE.goal).norm(dim=-1).max()) < 0.01 * WAVE.size
+    path = driven(ds, starts_around(WAVE, 20))
+    assert float(ds.obstacles[0].level(path).min()) > 0.98  # steps are not infinitely small
+    assert float((path[-1] - WAVE.goal).norm(dim=-1).max()) < 0.01 * WAVE.size
+    start = WAVE.positions[60]
+    slow = ds.rollout(start, torch.linspace(0, 0.4 * WAVE.duration, 20, dtype=torch.float64))
+    assert float(ds.obstacles[0].level(slow).min()) > 0.9999
+    assert float((slow[-1] - driven(ds, start, 0.4)[-1]).norm()) < 0.01 * WAVE.size
 
 
 def test_without_straight_motions_a_tube_would_hold_where_its_path_meets_the_surface(tube, monkeypatch):
     ds = AvoidingDS(tube, [sphere(WAVE.positions[90], 0.15 * WAVE.size)])
-    start = WAVE.positions[40][None]
-    arrived = ds.rollout(start, times(WAVE))[:, -1]
-    monkeypatch.setattr(TubeDS, "straight_velocity", TubeDS.forward)
-    held = ds.rollout(start, times(WAVE))[:, -1]
+    arrived = driven(ds, WAVE.positions[40])[-1]
+    monkeypatch.setattr(FieldTables, "straight", lambda tables: tables)
+    held = driven(ds, WAVE.positions[40])[-1]
     assert float((arrived - WAVE.goal).norm()) < 0.01 * WAVE.size
     assert float((held - WAVE.goal).norm()) > 0.1 * WAVE.size
 
@@ -114,6 +127,18 @@ def test_controller_is_the_module_with_its_limit_and_goal(tube):
     assert np.abs(moved(WAVE.goal.numpy() + 0.1)).max() < 1e-9
 
 
+def test_an_attractor_moved_in_place_takes_the_motion_and_not_the_obstacle(tube):
+    ds = AvoidingDS(tube, [sphere(WAVE.positions[90], 0.1)])
+    ds.attractor += 0.05
+    points = WAVE.positions[:40:4]
+    torch.testing.assert_close(ds.controller()(points.numpy()), ds(points).detach().numpy(), atol=1e-9, rtol=1e-9)
+    assert float(ds(WAVE.goal + 0.05).norm()) < 1e-9
+    body = ds.obstacles[0]
+    surface = body.center + torch.tensor([[0.1, 0.0], [0.0, -0.1]], dtype=torch.float64)
+    assert float(((surface - body.center) * ds(surface)).sum(-1).abs().max()) < 1e-9
+    assert torch.equal(tube.attractor, WAVE.goal)
+
+
 def test_far_away_and_at_the_goal_the_field_is_the_one_inside(tube):
     ds = AvoidingDS(tube, [sphere(WAVE.start + 100 * WAVE.size, 0.1)])
     torch.testing.assert_close(ds(WAVE.positions), tube(WAVE.positions), atol=1e-5, rtol=1e-5)
@@ -131,8 +156,7 @@ def test_it_is_a_module_of_torch(tube):
     assert ds(WAVE.positions[0]).shape == (2,)
     assert ds(WAVE.positions[:0]).shape == (0, 2)
     moved = AvoidingDS(tube.with_start_and_goal(WAVE.start, WAVE.goal + 0.05), [sphere(WAVE.positions[90], 0.1)])
-    path = moved.rollout(WAVE.start, times(WAVE))
-    assert float((path[-1] - WAVE.goal - 0.05).norm()) < 0.01 * WAVE.size
+    assert float((driven(moved, WAVE.start)[-1] - WAVE.goal - 0.05).norm()) < 0.01 * WAVE.size
 
 
 def test_bad_input_is_named(tube):
@@ -142,8 +166,11 @@ def test_bad_input_is_named(tube):
         AvoidingDS(tube, [sphere([0, 0, 0], 0.1)])
     with pytest.raises(ValueError, match="half_axes: expected numbers > 0"):
         Obstacle([0, 0], [0.1, 0])
-    with pytest.raises(ValueError, match="fit: expected a system without obstacles"):
-        AvoidingDS(tube, [sphere([9.0, 9], 0.1)]).fit(WAVE)
+    around = AvoidingDS(tube, [sphere([9.0, 9], 0.1)])
+    with pytest.raises(ValueError, match="fit: expected the system inside"):
+        around.fit(WAVE)
+    with pytest.raises(ValueError, match="AvoidingDS: expected the system inside, as what stands around"):
+        around.with_goal(WAVE.goal + 1)
     with pytest.raises(ValueError, match="lower, upper: expected the goal"):
         BoundedDS(tube, WAVE.goal, WAVE.goal + 1, 0.1)
 
