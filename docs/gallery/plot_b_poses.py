@@ -1,9 +1,8 @@
 """
-A motion that turns
-===================
+A tool that turns on its way
+============================
 
-Position and orientation as one system: the tool's axes along motions from where it was shown to begin, and from beside
-it, turned otherwise.
+Position and orientation in one motion: the tool's axes along the motion shown, and along those from three other poses.
 """
 
 import numpy as np
@@ -13,25 +12,28 @@ from scipy.spatial.transform import Rotation
 
 from latentds import PoseDemonstration, PoseDS, TubeDS
 
-s = np.linspace(0, 1, 200)
-positions = np.column_stack([s, 0.4 * np.sin(4 * s), 0.3 * np.cos(3 * s)])
-turns = Rotation.from_euler("zyx", np.column_stack([2.0 * (1 - s), 0.8 * s, 0.5 * np.sin(3 * s)]))
-shown = PoseDemonstration(positions, turns.as_quat(scalar_first=True), dt=0.02)
-pose = PoseDS(TubeDS(6)).fit(shown)
+share = np.linspace(0, 1, 200)
+way = share**3 * (10 - 15 * share + 6 * share**2)
+positions = np.stack([0.5 * way, 0.2 * np.sin(np.pi * way), 0.3 - 0.2 * way], 1)
+turns = Rotation.from_euler("zx", np.stack([1.5 * way, -1.2 * way**2], 1))
+shown = PoseDemonstration(positions, turns.as_quat()[:, [3, 0, 1, 2]], dt=0.02)
+pose = PoseDS(TubeDS(6, n_layers=100)).fit(shown)
 
-turned = (Rotation.from_rotvec([1.5, 0.5, 0.0]) * turns[0]).as_quat(scalar_first=True)
-first = np.concatenate([positions[0], shown.quaternions[0]])
-starts = torch.from_numpy(np.stack([first, np.concatenate([positions[0] + [0.0, 0.25, 0.2], turned])]))
+draw = torch.Generator().manual_seed(3)
+off = torch.randn(4, 7, generator=draw, dtype=torch.float64) * torch.tensor([0.06] * 3 + [0.1] * 4)
+off[0] = 0
 with torch.no_grad():
-    paths = pose.rollout(starts, torch.linspace(0, 5, 200, dtype=torch.float64)).numpy()
+    paths = pose.rollout(shown.poses[0] + off, shown.times).numpy()
 
-figure = Figure(figsize=(7, 5.6), layout="constrained")
+figure = Figure(figsize=(8, 5.5), layout="constrained")
 axes = figure.add_subplot(projection="3d")
-axes.plot(*positions.T, "--", color="#222222", lw=1)
-for path in paths:
-    axes.plot(*path[:, :3].T, color="#CC79A7", lw=1.4)
-    for point in path[::14]:
-        tool = 0.1 * Rotation.from_quat(point[3:], scalar_first=True).as_matrix()
-        for k, color in enumerate(("#D55E00", "#009E73", "#0072B2")):
-            axes.plot(*np.stack([point[:3], point[:3] + tool[:, k]]).T, color=color, lw=1)
-axes.set_aspect("equal")
+for path, count in zip(paths, (15, 4, 4, 4), strict=True):  # of the others, how they come in
+    axes.plot(*path[:, :3].T, color="#222222", lw=1)
+    way = np.append(0, np.linalg.norm(np.diff(path[:, :3], axis=0), axis=1).cumsum())
+    rows = path[np.searchsorted(way, np.linspace(0, way[-1], 15)[:count])]
+    frames = Rotation.from_quat(rows[:, [4, 5, 6, 3]]).as_matrix()
+    for axis, color in enumerate(("#D55E00", "#009E73", "#0072B2")):
+        axes.quiver(*rows[:, :3].T, *frames[:, :, axis].T, length=0.04, color=color, arrow_length_ratio=0)
+axes.set(xlabel="x", ylabel="y", zlabel="z", aspect="equal")
+axes.locator_params(nbins=4)
+axes.view_init(elev=25, azim=-115)
