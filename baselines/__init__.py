@@ -10,5 +10,18 @@ from .lyapunov import NeuralLyapunov
 from .promp import ProMP
 from .sdsef import SDSEF
 from .seds import SEDS
+from .tauseds import TauSEDS
 
-__all__ = ["CLFDM", "DMP", "FDM", "LPVDS", "NCDS", "SDSEF", "SEDS", "BehaviourCloning", "NeuralLyapunov", "ProMP"]
+__all__ = [
+    "CLFDM",
+    "DMP",
+    "FDM",
+    "LPVDS",
+    "NCDS",
+    "SDSEF",
+    "SEDS",
+    "BehaviourCloning",
+    "NeuralLyapunov",
+    "ProMP",
+    "TauSEDS",
+]

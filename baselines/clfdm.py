@@ -78,31 +78,11 @@ class CLFDM(NormalizedDS):
 
     def _train(self, pool: Pool, progress: bool) -> tuple[CLFDM, Training]:
         learner = CLFDM(**self.settings)
-        energy = learner.energy
         regression = fit_regression(pool, self.n_components, drawn_seed(self.seed))
         learner.regression.load_state_dict(regression.state_dict())
-        speeds, distances = (torch.linalg.vector_norm(part, dim=-1) for part in (pool.velocities, pool.points))
-        moving = (speeds > 1e-3 * speeds.max()) & (distances > ARRIVING_RADIUS)
-        points, headings = pool.points[moving], pool.velocities[moving] / speeds[moving, None]
-        energy.begin(points)
-
-        def rises() -> Tensor:
-            slopes = energy.gradient(points)
-            cosines: Tensor = (slopes * headings).sum(-1) / torch.linalg.vector_norm(slopes, dim=-1)
-            return cosines
-
-        begun = {part: part.detach().clone() for part in energy.parameters()}
-
-        def loss() -> Tensor:
-            rise = rises()
-            grown = torch.stack([(part - before).square().sum() for part, before in begun.items()]).sum()
-            return torch.where(rise > 0, rise.square(), -DESCENT_WEIGHT * rise.square()).mean() + GROWTH_WEIGHT * grown
-
-        history = descend_smoothly(loss, dict.fromkeys(energy.parameters(), 1.0), self.iterations)
+        history, notes = learner.energy.learn(pool, self.iterations)
         with torch.no_grad():
-            learner.pace.copy_(speeds.max())
-            share = float((rises() > 0).double().mean())
-        notes = (f"V rises along {share:.1%} of the demonstrated samples, where it bends the motion",) if share else ()
+            learner.pace.copy_(torch.linalg.vector_norm(pool.velocities, dim=-1).max())
         return learner, Training(history, notes, regression.mixture.n_components)
 
     def lyapunov(self, y: Tensor) -> Tensor:
@@ -140,11 +120,32 @@ class AsymmetricQuadratics(nn.Module):
         self.roots = nn.Parameter(eye.expand(n_asymmetric, -1, -1).clone())
         self.centers = nn.Parameter(torch.zeros(n_asymmetric, dim, dtype=torch.float64))
 
-    @torch.no_grad()
-    def begin(self, points: Tensor) -> None:
-        """Spread the centers along points (N, n)."""
-        places = torch.linspace(0, len(points) - 1, len(self.centers) + 2, dtype=torch.float64)[1:-1].round().long()
-        self.centers.copy_(points[places])
+    def learn(self, pool: Pool, iterations: int) -> tuple[tuple[float, ...], tuple[str, ...]]:
+        """Fall along the velocities of samples that move, by L-BFGS; the loss by step, and notes on where it rises."""
+        speeds, distances = (torch.linalg.vector_norm(part, dim=-1) for part in (pool.velocities, pool.points))
+        moving = (speeds > 1e-3 * speeds.max()) & (distances > ARRIVING_RADIUS)
+        points, headings = pool.points[moving], pool.velocities[moving] / speeds[moving, None]
+        with torch.no_grad():
+            places = torch.linspace(0, len(points) - 1, len(self.centers) + 2, dtype=torch.float64)[1:-1].round()
+            self.centers.copy_(points[places.long()])
+
+        def rises() -> Tensor:
+            slopes = self.gradient(points)
+            cosines: Tensor = (slopes * headings).sum(-1) / torch.linalg.vector_norm(slopes, dim=-1)
+            return cosines
+
+        begun = {part: part.detach().clone() for part in self.parameters()}
+
+        def loss() -> Tensor:
+            rise = rises()
+            grown = torch.stack([(part - before).square().sum() for part, before in begun.items()]).sum()
+            return torch.where(rise > 0, rise.square(), -DESCENT_WEIGHT * rise.square()).mean() + GROWTH_WEIGHT * grown
+
+        history = descend_smoothly(loss, dict.fromkeys(self.parameters(), 1.0), iterations)
+        with torch.no_grad():
+            share = float((rises() > 0).double().mean())
+        notes = (f"V rises along {share:.1%} of the demonstrated samples, where it bends the motion",) if share else ()
+        return history, notes
 
     def forward(self, z: Tensor) -> Tensor:
         """(..., n) -> (...)."""

@@ -57,16 +57,23 @@ class SEDS(NormalizedDS):
         self.iterations = whole_number(iterations, "iterations", at_least=1)
         self.systems = StableSystems(self.dim)
 
-    def _train(self, pool: Pool, progress: bool) -> tuple[SEDS, Training]:
+    def _train(self, pool: Pool, progress: bool, seen_through: Tensor | None = None) -> tuple[SEDS, Training]:
+        """``seen_through``: (N, n, n) by which the error at each sample is multiplied, or None."""
         learner = SEDS(**self.settings)
         systems = learner.systems
         systems.assign(fit_regression(pool, self.n_components, drawn_seed(self.seed)).mixture)
         steps = {systems.get_parameter(name): step for name, step in STEP_SIZES.items()}
         before = {parameter: parameter.detach().clone() for parameter in systems.mixture.parameters()}
-        unit = pool.velocities.square().mean()
+        shown = pool.velocities
+        if seen_through is not None:
+            shown = (seen_through * shown.unsqueeze(-2)).sum(-1)
+        unit = shown.square().mean()
 
         def plain_loss() -> Tensor:
-            error: Tensor = (systems(pool.points) - pool.velocities).square().mean() / unit
+            missed = systems(pool.points) - pool.velocities
+            if seen_through is not None:
+                missed = (seen_through * missed.unsqueeze(-2)).sum(-1)
+            error: Tensor = missed.square().mean() / unit
             lean: Tensor = (systems.slopes() + USUAL_RATE * torch.eye(self.dim).double()).square().sum()
             return error + RIDGE_WEIGHT * lean
 

@@ -40,7 +40,7 @@ class Body(NamedTuple):
 
 
 class Obstacle(nn.Module):
-    """{y: Γ(y) < 1}, convex, with Γ(y) = (Σ |z_i / a_i|^(2p))^(1/(2p)) of z = Rᵀ(y - c): an ellipsoid for p = 1.
+    """{y: Γ(y) < 1}, convex, with ``Γ(y) = (Σ |z_i / a_i|^(2p))^(1/(2p))``, z = Rᵀ(y - c): an ellipsoid for p = 1.
 
     Args:
         center: c, (n,) finite.

@@ -100,6 +100,7 @@ TOLD_JOINTS = (
 )
 TOOL = {
     "fast": ("FastDTW", "{:.2f}"),
+    "exact": ("exact DTW [m]", "{:.4f}"),
     "off_mm": ("farthest [mm]", "{:.1f}"),
     "arrival": ("arrives", "{:.2f}"),
     "torque": ("torque", "{:.2f}"),
