@@ -115,7 +115,7 @@ def _between(low: _Trial, high: _Trial) -> float:
     apart = high.step - low.step
     with np.errstate(invalid="ignore", over="ignore"):
         bend = low.slope + high.slope - 3 * (high.loss - low.loss) / apart
-        root = np.sqrt(bend**2 - low.slope * high.slope)
+        root = np.sqrt(bend * bend - low.slope * high.slope)  # a power of a Python float would raise
         share = 1 - (high.slope + np.sign(apart) * root - bend) / (high.slope - low.slope + 2 * np.sign(apart) * root)
     return low.step + apart * (float(np.clip(share, 0.1, 0.9)) if np.isfinite(share) else 0.5)
 

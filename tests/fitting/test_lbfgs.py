@@ -71,3 +71,14 @@ def test_the_gradient_given_is_not_written_over():
     held = np.full(4, 2.0)
     minimize(lambda x: (float((2 * x).sum()), held), np.ones(4), steps=3)
     np.testing.assert_array_equal(held, 2.0)
+
+
+def test_slopes_whose_squares_are_no_numbers_end_no_search():
+    """A loss that is huge beyond where it begins: the squares of its slopes exceed the largest float."""
+
+    def loss(x):
+        wall = max(0.0, x[0] - 0.1)
+        return float((x[0] - 0.05) ** 2 + 1e170 * wall), np.array([2 * (x[0] - 0.05) + 1e170 * (wall > 0)])
+
+    found = minimize(loss, np.array([-0.05]), steps=50)
+    assert found.at[0] == pytest.approx(0.05, abs=1e-4)
