@@ -104,7 +104,7 @@ def test_the_page_tells_each_figure_and_draws(tmp_path, shown):
     assert "FDM arrives in 1 of 2 undisturbed runs" in text
     assert "TubeDS arrives in 2 of 2" in text
     assert "| kinesthetic a (paper's a: 25.92) | TubeDS | yes | 0.25 | 0.2500 |" in text
-    assert text.split("## The tool")[1].split("| FDM |")[1].startswith(" **no** | 0.50 | 0.5 | — |")
+    assert text.split("## The tool")[1].split("| FDM |")[1].startswith(" **no** | 0.50 | 0.5000 | 0.5 | — |")
     assert {one.name for one in pictures} == {"paintings.png", "touched.png", "run.gif"}
     for one in pictures:
         assert one.stat().st_size > 3000
