@@ -22,8 +22,7 @@ class TauSEDS(NormalizedDS):
     Jacobian, inverted in closed form. V falls along every motion, and where demonstrations lead away from the goal
     first they can be learned, as far as V falls along them. τ has no derivative at the goal, so that the velocity there
     is no differentiable function; it is continuous, and 0. One thing is our own: the error that SEDS lowers is that of
-    the velocities z, J⁻¹ g - ż, where the paper's is that in its space; on ten of LASA's shapes, four shown, it is
-    lower by two fifths at demonstrations that were not.
+    the velocities that are seen, J⁻¹ g - ż, where the paper's is that in τ's space.
 
     Learns from one demonstration or from several, pooled; their goals' mean is the attractor. ``fit_report.mse`` is the
     mean over all N n entries of the squared velocity error, (units / second)²; ``n_layers`` is the mixture's K; the

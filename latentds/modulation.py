@@ -116,6 +116,11 @@ class _Modulated(StableDS):
     """A system made of another, in whose place it stands: the motion inside moves along with its attractor."""
 
     def __init__(self, ds: StableDS) -> None:
+        if isinstance(ds, _Modulated):
+            raise ValueError(
+                f"ds: expected a system that nothing holds back, got {type(ds).__name__}: what keeps out of one place "
+                "may lead into another; give all obstacles to one AvoidingDS"
+            )
         super().__init__(ds.dim)
         self.ds = ds
         self.to(ds.attractor)
@@ -152,22 +157,23 @@ class AvoidingDS(_Modulated):
     (:meth:`~latentds.StableDS.straight_velocity`). A tube that contracts onto a path that leads into an obstacle would
     hold the robot where the path meets the surface; straight motions part there, at a saddle point.
 
-    What it promises: no motion enters an obstacle; the goal is kept; where the system inside has no other equilibrium,
-    neither has this one but on surfaces, where the velocity runs along r. For a straight field and one obstacle that is
-    a saddle point, which all motions but those of measure zero pass (Huber et al.); for curved ones and for several
-    obstacles it is not proven. A motion that begins inside is led out.
+    What it promises: no motion enters an obstacle; the goal is kept, while they rest; where the system inside has no
+    other equilibrium, neither has this one but on surfaces, where the velocity runs along r. For a straight field and
+    one obstacle that is a saddle point, which all motions but those of measure zero pass (Huber et al.); for curved
+    ones and for several obstacles it is not proven. A motion that begins inside is led out.
 
     Args:
-        ds: any stable system.
+        ds: any stable system but one that is held back already.
         obstacles: of its dimension, their surfaces and ``margin`` around them not at the goal; they may overlap, but
             then motions may end between them.
         margin: >= 0, added to each half-axis: the robot's own radius and what it may be off.
 
     Attributes:
-        obstacles: with their margin; their ``center`` and ``velocity`` can be written in place.
+        obstacles: with their margin; their ``center`` and ``velocity`` can be written in place. Whether one then
+            covers the goal is not checked: motions end on its surface.
 
     Raises:
-        ValueError: for another dimension, or if an obstacle covers the goal.
+        ValueError: for another dimension, if an obstacle covers the goal, or for a ``ds`` that is held back.
     """
 
     def __init__(self, ds: StableDS, obstacles: Sequence[Obstacle], margin: float = 0.0) -> None:
@@ -212,7 +218,7 @@ class AvoidingController:
 
     def __call__(self, y: Any, out: Array | None = None) -> Array:
         """Velocity at ``y``: (..., n) -> (..., n) float64, into ``out`` if it is given."""
-        points = real_array(y, "y").astype(np.float64)
+        points = real_array(y, "y")
         self._straight.goal, self._straight.speed = self.field.goal, self.field.speed
         velocity = _around(np, points, self.field(points), self._straight(points), self.obstacles)
         if self.max_speed < math.inf:
@@ -235,7 +241,7 @@ class BoundedDS(_Modulated):
     only come back.
 
     Args:
-        ds: any stable system.
+        ds: any stable system but one that is held back already.
         lower, upper: (n,), lower < upper, the goal between them by more than ``margin``.
         margin: > 0, units of y, from where a wall is felt.
     """
@@ -323,7 +329,7 @@ def _above_zero(xp: Any, values: Any) -> Any:
 
 
 def _finite(values: Any, name: str) -> Array:
-    vector = real_array(values, name).astype(np.float64)
+    vector: Array = real_array(values, name)
     if vector.ndim != 1 or not np.isfinite(vector).all():
         raise ValueError(f"{name}: expected finite numbers (n,), got {values!r:.80}")
     return vector

@@ -404,7 +404,8 @@ def _to_chart(xp: Any, pose: Any, orientation: Any, length: Any) -> Any:
 def _from_chart(xp: Any, c: Any, orientation: Any, length: Any) -> Any:
     b = c[..., 3:] / (2 * length)
     w = 1 / xp.sqrt(1 + (b * b).sum(-1))[..., None]
-    return xp.concatenate([c[..., :3], _product(xp, orientation, xp.concatenate([w, w * b], -1))], -1)
+    unit = orientation / xp.sqrt((orientation * orientation).sum(-1))  # it may have been assigned by hand
+    return xp.concatenate([c[..., :3], _product(xp, unit, xp.concatenate([w, w * b], -1))], -1)
 
 
 def _twist(xp: Any, pose: Any, chart: Any, velocity: Any, length: Any, in_world: bool) -> Any:

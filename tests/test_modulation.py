@@ -169,6 +169,8 @@ def test_bad_input_is_named(tube):
     around = AvoidingDS(tube, [sphere([9.0, 9], 0.1)])
     with pytest.raises(ValueError, match="fit: expected the system inside"):
         around.fit(WAVE)
+    with pytest.raises(ValueError, match="ds: expected a system that nothing holds back, got AvoidingDS"):
+        BoundedDS(around, WAVE.goal - 1, WAVE.goal + 1, 0.1)
     with pytest.raises(ValueError, match="AvoidingDS: expected the system inside, as what stands around"):
         around.with_goal(WAVE.goal + 1)
     with pytest.raises(ValueError, match="lower, upper: expected the goal"):

@@ -328,3 +328,11 @@ def test_a_recording_is_read_by_the_names_of_its_columns(shown, names, tmp_path)
     np.testing.assert_allclose((read.quaternions * shown.quaternions).sum(1).abs(), 1, atol=1e-9)
     with pytest.raises(ValueError, match="recording: expected seven columns"):
         PoseDemonstration.of(Demonstration(rows, shown.dt))
+
+
+def test_an_orientation_assigned_by_hand_need_not_have_norm_one(pose):
+    other = copy.deepcopy(pose)
+    other.orientation = 1.7 * pose.orientation
+    where = drawn(5)
+    torch.testing.assert_close(other(where), pose(where))
+    torch.testing.assert_close(other.attractor, pose.attractor)

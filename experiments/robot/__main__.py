@@ -62,7 +62,7 @@ def main(
     report.write(out / "rows.csv", rows.drop(columns="drawn").to_csv(index=False))
     folder = out if doc is None else doc.parent
     drawn = page.pictures(rows, every, folder / "images" / "robot")
-    text = page.document(rows, every, drawn)
+    text = page.document(rows, drawn)
     report.write(out / "robot.md" if doc is None else doc, text)
     console.print(text, markup=False, highlight=False, soft_wrap=True)
     for row in failed.to_dict("records"):

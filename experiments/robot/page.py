@@ -43,7 +43,7 @@ FRAMES, FRAME_MS, GIF_COLORS = 60, 80, 64
 SHOWN_LIGHT = "#9BD1FF"
 
 
-def document(rows: pd.DataFrame, every: Sequence[Demonstration], pictures: Sequence[Path]) -> str:
+def document(rows: pd.DataFrame, pictures: Sequence[Path]) -> str:
     """The page, in Markdown."""
     tools = rows[rows["dim"] == 3]
     joints = rows[rows["dim"] == 7]
@@ -128,7 +128,7 @@ JOINTS = {
 CAPTIONS = {
     "paintings": "Light paintings: the tool's light in a long exposure, of what was shown, pale, and of three methods",
     "touched": "TubeDS pushed, held, its goal moved, and around a ball, over what was shown, dashed",
-    "run": "The arm draws the unstable spiral",
+    "run": "The arm draws a spiral",
 }
 
 

@@ -161,13 +161,18 @@ def of_joints(ds: StableDS, shown: Demonstration) -> dict[str, Any]:
     figures |= {"track_rad": follow.error, "off_mm": 1e3 * gaps(free.tool, drawn).max()}
     figures |= {"arrival": arrival(free, free.q, goal, shown.size) / shown.duration}
     pushing = FollowJoints(arm, ds.controller(), dt=DT)
-    up = np.array([0.0, 0.0, -PUSH])
+    down = np.array([0.0, 0.0, -PUSH])
     pushed = simulate(
-        arm, curve[0], pushing, PATIENCE * shown.duration, lambda t: up if half <= t < half + PUSH_SECONDS else None, DT
+        arm,
+        curve[0],
+        pushing,
+        PATIENCE * shown.duration,
+        lambda t: down if half <= t < half + PUSH_SECONDS else None,
+        DT,
     )
     figures |= {"push_off_mm": 1e3 * gaps(pushed.tool, drawn).max(), "push_track_rad": pushing.error}
     figures |= {"push_end_rad": float(np.abs(pushed.q[-1] - goal).max())}
-    kept = {"free": thinned(free.tool), "shown": thinned(drawn), "angles": thinned(free.q)}
+    kept = {"free": thinned(free.tool), "shown": thinned(drawn)}
     return plain(figures) | {"drawn": json.dumps(kept)}
 
 

@@ -76,22 +76,25 @@ class PassiveController:
             x: (n,) position, as the field takes it.
             velocity: (n,) ẋ, measured.
             dt: seconds since the last call, > 0.
-            out: (n,) float64 for the answer; returned. Nothing is allocated if it is given.
+            out: (n,) float64 for the answer; returned. Nothing is allocated here if it is given.
 
         Raises:
-            ValueError: for another shape, or velocities or a dt that are no finite numbers; the field says so of x.
+            ValueError: for another shape, or velocities or a dt that are no finite numbers; the field says so of x. The
+                tank is then what it was.
         """
         if getattr(velocity, "shape", None) != (self.dim,) or not math.isfinite(velocity.dot(velocity)):
             raise ValueError(f"velocity: expected ({self.dim},) finite numbers, got {velocity!r:.80}")
         if not 0 < dt < math.inf:
             raise ValueError(f"dt: expected seconds > 0, got {dt!r:.80}")
+        wanted = self.field(x, out=self._wanted)
+        speed_squared = wanted.dot(wanted)
+        if not math.isfinite(speed_squared):
+            raise ValueError(f"field: expected finite velocities, got {wanted!r:.80}")
         force = self._force
         # The trapezoid of the measured velocities is the way of the last cycle; the force was held over it.
         given = 0.5 * dt * (force.dot(self._velocity) + force.dot(velocity))
         self.tank = min(self.energy, self.tank - given)
         self._velocity[:] = velocity
-        wanted = self.field(x, out=self._wanted)
-        speed_squared = wanted.dot(wanted)
         forward = wanted.dot(velocity) / speed_squared if speed_squared > 0 else 0.0  # share of f that ẋ has
         # Also where the drive would brake: from rest, the cycle after it would give.
         share = min(1.0, max(0.0, self.tank / (RESERVE * self.energy)))

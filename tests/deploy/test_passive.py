@@ -125,3 +125,7 @@ def test_bad_measurements_are_named():
         controller(np.ones(2), np.ones(3), DT)
     with pytest.raises(ValueError, match="dt: expected"):
         controller(np.ones(2), np.ones(2), 0.0)
+    lost = PassiveController(lambda x, out: np.full(2, np.nan), 2, along=1.0, across=1.0, energy=1.0)
+    with pytest.raises(ValueError, match="field: expected finite velocities"):
+        lost(np.ones(2), np.ones(2), DT)
+    assert lost.tank == 1.0

@@ -100,7 +100,7 @@ def test_the_page_tells_each_figure_and_draws(tmp_path, shown):
     rows["follows"] = rows["method"] == "TubeDS"
     rows.loc[0, "arrival"] = math.inf
     pictures = page.pictures(rows, [shown, guided], tmp_path / "images" / "robot")
-    text = page.document(rows, [shown, guided], pictures)
+    text = page.document(rows, pictures)
     assert "FDM arrives in 1 of 2 undisturbed runs" in text
     assert "TubeDS arrives in 2 of 2" in text
     assert "| kinesthetic a (paper's a: 25.92) | TubeDS | yes | 0.25 | 0.2500 |" in text
