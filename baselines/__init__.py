@@ -5,6 +5,7 @@ from .cloning import BehaviourCloning
 from .contracting import NCDS
 from .dmp import DMP
 from .fdm import FDM
+from .lddmm import LDDMM
 from .lpvds import LPVDS
 from .lyapunov import NeuralLyapunov
 from .promp import ProMP
@@ -16,6 +17,7 @@ __all__ = [
     "CLFDM",
     "DMP",
     "FDM",
+    "LDDMM",
     "LPVDS",
     "NCDS",
     "SDSEF",
