@@ -1,5 +1,6 @@
 """Methods to compare with."""
 
+from .attractors import MultipleAttractors, separate
 from .clfdm import CLFDM
 from .cloning import BehaviourCloning
 from .contracting import NCDS
@@ -23,7 +24,9 @@ __all__ = [
     "SDSEF",
     "SEDS",
     "BehaviourCloning",
+    "MultipleAttractors",
     "NeuralLyapunov",
     "ProMP",
     "TauSEDS",
+    "separate",
 ]
