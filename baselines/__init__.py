@@ -4,8 +4,10 @@ from .attractors import MultipleAttractors, separate
 from .clfdm import CLFDM
 from .cloning import BehaviourCloning
 from .contracting import NCDS
+from .cycles import LimitCycleFlow
 from .dmp import DMP
 from .fdm import FDM
+from .imitation import ImitationFlow
 from .lddmm import LDDMM
 from .lpvds import LPVDS
 from .lyapunov import NeuralLyapunov
@@ -24,6 +26,8 @@ __all__ = [
     "SDSEF",
     "SEDS",
     "BehaviourCloning",
+    "ImitationFlow",
+    "LimitCycleFlow",
     "MultipleAttractors",
     "NeuralLyapunov",
     "ProMP",

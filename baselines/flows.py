@@ -99,11 +99,14 @@ class Normalized(NamedTuple):
     center: Tensor
     scale: Tensor
     duration: float
+    steps: Tensor
+    """(m,) from sample to sample of each, in durations"""
 
     @classmethod
-    def of(cls, shown: Sequence[Demonstration]) -> Normalized:
+    def of(cls, shown: Sequence[Demonstration], *, closed: bool = False) -> Normalized:
+        """At least one demonstration; one that ends where it begins is refused by a ValueError, unless ``closed``."""
         goal = torch.stack([d.goal for d in shown]).mean(0)
-        for d in shown:
+        for d in shown if not closed else ():
             goal_apart(d, goal)
         every = torch.cat([d.positions for d in shown])
         low, high = every.amin(0), every.amax(0)
@@ -134,6 +137,7 @@ class Normalized(NamedTuple):
             center,
             scale,
             duration,
+            points.new_tensor([d.dt / duration for d in shown]),
         )
 
     def straightened(self, share: float) -> Normalized:
