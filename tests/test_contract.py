@@ -33,6 +33,13 @@ def test_contract_in_other_dimensions(check):
     check()
 
 
+@parametrize_stable_ds(
+    {"neighbours": lambda dim: ChebyshevDS(dim, n_layers=15, embedding="neighbours")}, dims=[3], fitted=[True]
+)
+def test_contract_of_the_other_embedding(check):
+    check()
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_where_the_motion_lies_does_not_matter(method):
     """Beyond the contract: ours do not mind where the origin is, to what training makes of another rounding."""

@@ -23,12 +23,14 @@ from experiments.paper.document import Document
 from experiments.paper.framework import framework
 from experiments.paper.joints import joints
 from experiments.paper.latent_space import latent_space
+from experiments.paper.maps import maps
 from experiments.paper.planes import orbits, planes
 from experiments.paper.sensitivity import sensitivity
 from experiments.paper.similarity import replications, similarity
 from experiments.paper.study import FULL, QUICK, Plan, Study
 from experiments.paper.table_one import table_one, tuned
 from experiments.paper.table_two import table_two
+from experiments.paper.works import works
 from latentds import Demonstration
 
 SECTIONS: dict[str, Callable[[Study, Document], None]] = {
@@ -36,6 +38,7 @@ SECTIONS: dict[str, Callable[[Study, Document], None]] = {
     "Table I: the paper's hyperparameters": table_one,
     "Tuning by the paper's rule": tuned,
     "Claims about the latent space": latent_space,
+    "Another graph, another map": maps,
     "Two dimensions: Archimedean spiral and drawn characters": planes,
     "Joint space, Table III": joints,
     "Sensitivity": sensitivity,
@@ -43,6 +46,7 @@ SECTIONS: dict[str, Callable[[Study, Document], None]] = {
     "Table II: SDS-EF": table_two,
     "Replications": replications,
     "DMP's forward orbits": orbits,
+    "Every method that the paper cites": works,
 }
 
 

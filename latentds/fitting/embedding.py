@@ -6,6 +6,9 @@ import math
 
 import numpy as np
 import scipy
+import scipy.sparse
+import scipy.sparse.linalg
+import scipy.spatial
 
 from ..arguments import Array, whole_number
 from ..curves import evenly_resampled, extent, jitter, progress_along
@@ -37,6 +40,43 @@ def chebyshev_columns(n_points: int, dim: int) -> Array:
     theta = _angles(n_points, dim)
     index = np.arange(n_points)[:, None]
     return np.cos((index + 0.5) * theta) / np.cos(theta / 2)
+
+
+def neighbour_columns(positions: Array, n_neighbours: int = 10) -> Array:
+    """As :func:`chebyshev_columns`, of a graph that knows where points lie: (N, n), (N, n) from start to goal.
+
+    Each copy of the path gives way to Belkin and Niyogi's graph (2003): edges between points of which one is among the
+    ``n_neighbours`` nearest of the other, or that follow each other, so that it is one graph; weights by the heat
+    kernel, as wide as the mean square of those distances; L u = λ D u. The copies are joined at the start, by edges of
+    weight 1, as the paper joins its paths.
+
+    Args:
+        positions: (N, n), N >= 3.
+        n_neighbours: at least 1, at most N - 1.
+
+    Source: Belkin and Niyogi, "Laplacian eigenmaps for dimensionality reduction and data representation", Neural
+    Computation 15 (2003), Sec. 2.
+    """
+    count, dim = positions.shape
+    nearest = scipy.spatial.KDTree(positions).query(positions, min(n_neighbours, count - 1) + 1)[1][:, 1:]
+    ends = np.stack([np.repeat(np.arange(count), nearest.shape[1]), nearest.ravel()])
+    ends = np.concatenate([ends, [np.arange(count - 1), np.arange(1, count)]], axis=1)
+    first, second = np.unique(np.sort(ends, axis=0), axis=1)
+    gaps = ((positions[first] - positions[second]) ** 2).sum(1)
+    upper = scipy.sparse.coo_array((np.exp(-gaps / gaps.mean()), (first, second)), shape=(count, count))
+    weights = (upper + upper.T).tocsc()
+    degrees = weights.sum(0)
+    degrees[0] += 2
+    laplacian = scipy.sparse.diags_array(degrees) - weights
+    columns = np.empty((count, dim))
+    for j in range(dim):
+        joined = laplacian.copy()
+        joined[0, 0] -= 2 * math.cos(2 * math.pi * (j + 1) / (dim + 1))
+        column = scipy.sparse.linalg.eigsh(
+            joined.tocsc(), 1, scipy.sparse.diags_array(degrees).tocsc(), sigma=0, v0=np.ones(count)
+        )[1][:, 0]
+        columns[:, j] = column / column[-1]
+    return columns
 
 
 def straight_column(n_points: int) -> Array:

@@ -86,7 +86,8 @@ class GreedyDS(LatentDS):
             (f"learned the mean of {len(shown)} demonstrations, as it learns from one",) if len(shown) > 1 else ()
         )
         goal_apart(motion, motion.goal)
-        psi, points, latent = self.diffeomorphism, motion.positions.numpy(), self.latent_line(motion)
+        psi, points = self.diffeomorphism, motion.positions.numpy()
+        latent, law = self._embedded(motion)
         n_layers, beta, mu, notes = self._hyperparameters(latent, points)
         layers = match_along(linear_homotopy(latent, points, self.steps), n_layers, beta, mu)
         if self.refined:
@@ -94,13 +95,17 @@ class GreedyDS(LatentDS):
         if self.pinned:
             layers = pin_ends(layers, latent, points, mu)
         psi.assign(*(torch.from_numpy(part) for part in layers))
-        self.dynamics.law = self.time_law(motion.duration).to(self.attractor)
+        self.dynamics.law = law.to(self.attractor)
         with torch.no_grad():
             self.attractor.copy_(motion.goal)
             self.start.copy_(motion.start)
             missed = psi(torch.from_numpy(latent).to(self.attractor)) - motion.positions.to(self.attractor)
         self._refuse_folds(motion)
         return Learned(float(missed.square().mean()), psi.n_layers, notes=(*averaged, *notes))
+
+    def _embedded(self, motion: Demonstration) -> tuple[Array, TimeLaw]:
+        """The latent points (N, n) and the law by which one moves through them."""
+        return self.latent_line(motion), self.time_law(motion.duration)
 
     def _hyperparameters(self, latent: Array, points: Array) -> tuple[int, float, float, tuple[str, ...]]:
         """M, β and μ, and a note of those that were not given."""

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
 from numpy.polynomial import Chebyshev
 from scipy.linalg import eigh
 
@@ -15,6 +16,7 @@ from latentds.fitting.embedding import (
     chebyshev_columns,
     chebyshev_eigenvalues,
     map_to_endpoints,
+    neighbour_columns,
     straight_column,
 )
 from tests.motions import pause, rest_at_both_ends
@@ -54,6 +56,31 @@ def test_eigenvalues_are_the_smallest_after_zero(dim, n_points):
     found = eigh(laplacian(n_points, dim + 1), eigvals_only=True)
     assert abs(found[0]) < 1e-12
     assert np.sort(chebyshev_eigenvalues(n_points, dim)) == pytest.approx(found[1 : dim + 1], abs=1e-13)
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_columns_of_neighbours_are_eigenvectors_of_their_copied_graph(dim, draw):
+    """Belkin and Niyogi's graph, written out: all copies at once, joined at their starts."""
+    points = np.cumsum(np.abs(torch.randn(30, dim, generator=draw, dtype=torch.float64).numpy()) + 0.1, axis=0)
+    squares = ((points[:, None] - points) ** 2).sum(-1)
+    near = squares <= np.sort(squares, axis=1)[:, [4]]
+    near = (near | near.T | (np.abs(np.subtract.outer(range(30), range(30))) == 1)) & ~np.eye(30, dtype=bool)
+    weights = np.where(near, np.exp(-squares / squares[near].mean()), 0)
+    copies = dim + 1
+    whole = np.kron(np.eye(copies), weights)
+    for k in range(copies):
+        a, b = 30 * k, 30 * ((k + 1) % copies)
+        whole[a, b] += 1
+        whole[b, a] += 1
+    degrees = np.diag(whole.sum(1))
+    columns = neighbour_columns(points, 4)
+    values = np.linalg.eigvals(np.linalg.solve(degrees, degrees - whole)).real
+    for j, column in enumerate(columns.T, start=1):
+        turned = np.outer(np.exp(2j * math.pi * j * np.arange(copies) / copies), column).ravel()
+        value = (turned.conj() @ (degrees - whole) @ turned / (turned.conj() @ degrees @ turned)).real
+        assert np.abs((degrees - whole) @ turned - value * degrees @ turned).max() < 1e-9
+        assert (np.sort(values)[1 : dim + 1] == pytest.approx(value, abs=1e-9)) or dim > 1
+        assert value < np.sort(values)[dim] + 1e-9  # the smallest after 0, block by block
 
 
 @pytest.mark.parametrize("dim", range(1, 9))
