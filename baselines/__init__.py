@@ -1,6 +1,7 @@
 """Methods to compare with."""
 
 from .attractors import MultipleAttractors, separate
+from .avoidance import AvoidanceTerms
 from .clfdm import CLFDM
 from .cloning import BehaviourCloning
 from .contracting import NCDS
@@ -25,6 +26,7 @@ __all__ = [
     "NCDS",
     "SDSEF",
     "SEDS",
+    "AvoidanceTerms",
     "BehaviourCloning",
     "ImitationFlow",
     "LimitCycleFlow",

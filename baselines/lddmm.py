@@ -185,7 +185,7 @@ class LDDMM(LatentDS):
         dim: n >= 1.
         n_landmarks: K >= 2.
         width: > 0, of the kernel, in sizes of the demonstration; None for the one of ``WIDTHS`` that comes nearer.
-        iterations: of L-BFGS at most, each time, >= 1.
+        iterations: of L-BFGS at most, >= 1; a quarter of them again each time that more steps are taken.
         straight: whether latent points lie on a straight line, even in time, as FDM's do, and not on the eigenmap's.
 
     Source: Joshi and Miller, "Landmark matching via large deformation diffeomorphisms", IEEE TIP 9 (2000).
@@ -249,5 +249,5 @@ class LDDMM(LatentDS):
         flow, history = min(tried, key=lambda one: one[1][-1])
         while flow.integration_gap(latent) > INTEGRATION_LIMIT and 2 * len(flow.steps) <= MOST_STEPS:
             flow.steps = even_steps(2 * len(flow.steps))
-            history += flow.match(points[chosen], self.iterations)
+            history += flow.match(points[chosen], -(-self.iterations // 4))
         return flow, history

@@ -8,13 +8,16 @@ from baselines import (
     CLFDM,
     DMP,
     FDM,
+    LDDMM,
     LPVDS,
     NCDS,
     SDSEF,
     SEDS,
     BehaviourCloning,
+    ImitationFlow,
     NeuralLyapunov,
     ProMP,
+    TauSEDS,
 )
 from experiments.compared import greedy
 from experiments.field.motions import Motion
@@ -27,10 +30,13 @@ METHODS: dict[str, Factory] = {
     OURS: TubeDS,
     "Chebyshev": partial(ChebyshevDS, n_layers=None),
     "FDM": partial(FDM, n_layers=None),
+    "LDDMM": LDDMM,
     "SDS-EF": SDSEF,
+    "ImitationFlow": ImitationFlow,
     "CLF-DM": CLFDM,
     "LPV-DS": LPVDS,
     "SEDS": SEDS,
+    "τ-SEDS": TauSEDS,
     "NeuralLyapunov": NeuralLyapunov,
     "NCDS": NCDS,
     "BehaviourCloning": BehaviourCloning,
@@ -41,7 +47,17 @@ METHODS: dict[str, Factory] = {
 where the paper prints none."""
 PHASE_DRIVEN = ("ProMP", "DMP")
 """These follow a clock and are no fields: ranked apart."""
-DRAWN_AT_RANDOM = ("SDS-EF", "NCDS", "NeuralLyapunov", "BehaviourCloning", "LPV-DS", "SEDS", "CLF-DM")
+DRAWN_AT_RANDOM = (
+    "SDS-EF",
+    "NCDS",
+    "NeuralLyapunov",
+    "BehaviourCloning",
+    "LPV-DS",
+    "SEDS",
+    "CLF-DM",
+    "τ-SEDS",
+    "ImitationFlow",
+)
 """Their fits begin at random, so that three seeds tell how much that matters."""
 
 

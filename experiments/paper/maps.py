@@ -54,7 +54,7 @@ def maps(study: Study, document: Document) -> None:
     lines = []
     for motion, row in zip(motions, rows, strict=True):
         near, flow = row["path"], row["LDDMM"]
-        errors = [f"{one.mse:.1e}" if one else "turns back" for one in row.values()]
+        errors = [f"{one.mse:.1e}" if one else "refused" for one in row.values()]
         both = [
             [f"{one.seconds:.1f}", f"{one.gap:.0e}", f"{one.inverse:.1f}"] if one else ["—"] * 3 for one in (near, flow)
         ]
