@@ -2,6 +2,7 @@
 
 from .attractors import MultipleAttractors, separate
 from .avoidance import AvoidanceTerms
+from .cdsp import CDSP
 from .clfdm import CLFDM
 from .cloning import BehaviourCloning
 from .contracting import NCDS
@@ -18,6 +19,7 @@ from .seds import SEDS
 from .tauseds import TauSEDS
 
 __all__ = [
+    "CDSP",
     "CLFDM",
     "DMP",
     "FDM",

@@ -73,9 +73,7 @@ class LPVDS(NormalizedDS):
         learner.mixture.assign(weights, means, covariances)
         with torch.no_grad():
             shares = learner.mixture(pool.points).numpy()
-        metric = _metric(points, velocities)
-        matrices, exact = _matrices(points, velocities, shares, metric)
-        learner.systems.assign(metric, matrices)
+        exact = learner.systems.solve(points, velocities, shares)
         notes = (f"{len(weights)} components", *(() if exact else ("the solver's linear systems are not its best",)))
         return learner, Training((), notes)
 
@@ -140,6 +138,13 @@ class LinearSystems(nn.Module):
         values = np.sqrt(values.clip(min=0))
         root = np.linalg.cholesky(metric - 1e-3 * np.eye(len(metric)))
         assign(self, {"root": root, "turning": pulled / 2, "damping": vectors * values[:, None, :]})
+
+    def solve(self, points: Array, velocities: Array, shares: Array) -> bool:
+        """Become what the two convex programs find for samples (N, n) with shares (N, m); whether exactly so."""
+        metric = _metric(points, velocities)
+        matrices, exact = _matrices(points, velocities, shares, metric)
+        self.assign(metric, matrices)
+        return exact
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         make_room(self, state_dict, prefix, ["turning", "damping"])

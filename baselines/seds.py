@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Protocol
+
 import torch
 from torch import Tensor, nn
 
@@ -62,30 +65,7 @@ class SEDS(NormalizedDS):
         learner = SEDS(**self.settings)
         systems = learner.systems
         systems.assign(fit_regression(pool, self.n_components, drawn_seed(self.seed)).mixture)
-        steps = {systems.get_parameter(name): step for name, step in STEP_SIZES.items()}
-        before = {parameter: parameter.detach().clone() for parameter in systems.mixture.parameters()}
-        shown = pool.velocities
-        if seen_through is not None:
-            shown = (seen_through * shown.unsqueeze(-2)).sum(-1)
-        unit = shown.square().mean()
-
-        def plain_loss() -> Tensor:
-            missed = systems(pool.points) - pool.velocities
-            if seen_through is not None:
-                missed = (seen_through * missed.unsqueeze(-2)).sum(-1)
-            error: Tensor = missed.square().mean() / unit
-            lean: Tensor = (systems.slopes() + USUAL_RATE * torch.eye(self.dim).double()).square().sum()
-            return error + RIDGE_WEIGHT * lean
-
-        def loss() -> Tensor:
-            return plain_loss() + MIXTURE_WEIGHT * sum(
-                ((p - known) / steps[p]).square().sum() for p, known in before.items()
-            )
-
-        history = descend_smoothly(
-            plain_loss, {p: step for p, step in steps.items() if p not in before}, self.iterations
-        )
-        history += descend_smoothly(loss, steps, self.iterations)
+        history = match_velocities(systems, pool, STEP_SIZES, self.iterations, seen_through)
         return learner, Training(history, (), systems.mixture.n_components)
 
     def normalized_velocity(self, u: Tensor) -> Tensor:
@@ -132,3 +112,59 @@ class StableSystems(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: object) -> None:
         make_room(self, state_dict, prefix, ["spins", "pulls"])
         super()._load_from_state_dict(state_dict, prefix, *rest)  # type: ignore[arg-type]
+
+
+class MixedSystems(Protocol):
+    """z ↦ Σ_k γ_k(z) A_k z, learned by :func:`match_velocities`."""
+
+    mixture: GaussianMixture
+
+    def slopes(self) -> Tensor:
+        """(K, n, n), near ``-USUAL_RATE`` I where nothing is shown."""
+
+    def get_parameter(self, target: str) -> nn.Parameter: ...
+
+    def __call__(self, z: Tensor) -> Tensor: ...
+
+
+def match_velocities(
+    systems: MixedSystems,
+    pool: Pool,
+    step_sizes: Mapping[str, float],
+    iterations: int,
+    seen_through: Tensor | None = None,
+) -> tuple[float, ...]:
+    """Move linear systems by L-BFGS to the least squared error of velocities, then the mixture with them.
+
+    Args:
+        systems: with the mixture that EM found.
+        pool: what is shown.
+        step_sizes: of each parameter, as of ``STEP_SIZES``; those of the mixture begin with "mixture.".
+        iterations: at most, each time.
+        seen_through: (N, n, n) by which the error at each sample is multiplied, or None.
+
+    Returns:
+        The loss after each iteration.
+    """
+    steps = {systems.get_parameter(name): step for name, step in step_sizes.items()}
+    before = {parameter: parameter.detach().clone() for parameter in systems.mixture.parameters()}
+    shown = pool.velocities
+    if seen_through is not None:
+        shown = (seen_through * shown.unsqueeze(-2)).sum(-1)
+    unit = shown.square().mean()
+
+    def plain_loss() -> Tensor:
+        missed = systems(pool.points) - pool.velocities
+        if seen_through is not None:
+            missed = (seen_through * missed.unsqueeze(-2)).sum(-1)
+        error: Tensor = missed.square().mean() / unit
+        lean: Tensor = (systems.slopes() + USUAL_RATE * torch.eye(pool.points.shape[1]).double()).square().sum()
+        return error + RIDGE_WEIGHT * lean
+
+    def loss() -> Tensor:
+        return plain_loss() + MIXTURE_WEIGHT * sum(
+            ((p - known) / steps[p]).square().sum() for p, known in before.items()
+        )
+
+    history = descend_smoothly(plain_loss, {p: step for p, step in steps.items() if p not in before}, iterations)
+    return history + descend_smoothly(loss, steps, iterations)

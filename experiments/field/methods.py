@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from baselines import (
+    CDSP,
     CLFDM,
     DMP,
     FDM,
@@ -35,6 +36,7 @@ METHODS: dict[str, Factory] = {
     "ImitationFlow": ImitationFlow,
     "CLF-DM": CLFDM,
     "LPV-DS": LPVDS,
+    "CDSP": CDSP,
     "SEDS": SEDS,
     "τ-SEDS": TauSEDS,
     "NeuralLyapunov": NeuralLyapunov,
@@ -56,6 +58,7 @@ DRAWN_AT_RANDOM = (
     "SEDS",
     "CLF-DM",
     "τ-SEDS",
+    "CDSP",
     "ImitationFlow",
 )
 """Their fits begin at random, so that three seeds tell how much that matters."""
