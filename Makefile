@@ -4,7 +4,7 @@ BIN := .venv/bin
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help compare test test-fast check speed ablation fuzz paper training field robot hard-curves lasa docs clean
+.PHONY: help compare test test-fast check attractors speed ablation fuzz paper training field robot hard-curves lasa docs clean
 
 help: # What there is to make.
 	@grep -E '^[a-z -]+:.*# ' $(MAKEFILE_LIST) | sed -E 's/^([a-z -]+):[^#]*# (.*)/\1|\2/' | awk -F'|' '{printf "  make %-34s %s\n", $$1, $$2}'
@@ -24,7 +24,7 @@ check: .venv/installed # Linters and types.
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-speed ablation fuzz paper training field robot: .venv/installed # The studies: see the top of experiments/NAME.
+attractors speed ablation fuzz paper training field robot: .venv/installed # The studies: see the top of experiments/NAME.
 	$(BIN)/python -m experiments.$@ $(ARGS)
 
 hard-curves: .venv/installed # Seventy curves that are hard to learn from: which of them TubeDS follows.
