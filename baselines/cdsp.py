@@ -31,8 +31,9 @@ class CDSP(NormalizedDS):
     As LPV-DS's the systems are linear and under one quadratic form, and the inequality holds whatever the parameters
     are. What differs is what is learned: there a mixture, a metric and linear systems one after the other, here the
     mixture of positions and velocities that EM finds, and from the start that LPV-DS's two convex programs give, all
-    three together by L-BFGS on the squared error of velocities. Ours are the constant rate, where the paper's γ may
-    depend on the place, and that start; M is constant in the paper's experiments, too.
+    three together by L-BFGS on the squared error of velocities. Ours are the constant rate and metric, where the
+    paper's may depend on the place; that start; and that A is free, where regression by a mixture has it from the
+    covariances.
 
     Learns from one demonstration or from several, pooled; their goals' mean is the attractor. ``fit_report.mse`` is the
     mean over all N n entries of the squared velocity error, (units / second)²; ``n_layers`` is K. Needs the extra

@@ -18,7 +18,7 @@ pytest.importorskip("cvxpy")
 
 
 def small(dim, **settings):
-    return CDSP(dim, **{"n_components": 2, "iterations": 10, "seed": 0, **settings})
+    return CDSP(dim, **{"n_components": 2, "iterations": 3, "seed": 0, **settings})
 
 
 @parametrize_stable_ds({"CDSP": small}, dims=[2, 3, 7], fitted=[True])
@@ -36,7 +36,7 @@ def curl():
     return CDSP(2, seed=0).fit(datasets.drawn("curl", n_points=200))
 
 
-def test_v_falls_at_the_rate_whatever_the_parameters_are(curl, draw):
+def test_v_falls_at_the_rate_whatever_the_parameters_are(draw):
     ds = CDSP(3)
     ds.systems.load_state_dict(small(3, n_components=4).fit(wavy_motion(3)).systems.state_dict())
     with torch.no_grad():
@@ -50,8 +50,10 @@ def test_v_falls_at_the_rate_whatever_the_parameters_are(curl, draw):
 def test_two_motions_may_part_for_a_while(curl):
     """The largest growth of their distance in M, by the derivative of the field along the demonstration."""
     shown = datasets.drawn("curl", n_points=200)
-    slopes = torch.func.vmap(torch.func.jacrev(curl))(shown.positions) * shown.duration
-    metric = curl.systems.linear.metric()
+    slopes = torch.func.vmap(torch.func.jacrev(curl))(shown.positions).detach() * shown.duration
+    metric = curl.systems.linear.metric().detach()
+    energy, rate = torch.func.jvp(curl.lyapunov, (shown.positions[:-1],), (curl(shown.positions[:-1]),))
+    assert bool((rate * shown.duration <= -2 * LEAST_RATE * energy * (1 - 1e-9)).all())  # and yet:
     root = torch.linalg.cholesky(metric).mT
     seen = root @ slopes @ torch.linalg.inv(root)
     growth = torch.linalg.eigvalsh((seen + seen.mT) / 2)[:, -1]
