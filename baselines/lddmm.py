@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -98,7 +99,7 @@ class LandmarkFlow(Diffeomorphism):
 
     def energy(self, landmarks: Tensor, momenta: Tensor) -> Tensor:
         """H: (K, n), (K, n) -> ()."""
-        return 0.5 * (self.kernel(landmarks, landmarks) * (momenta @ momenta.mT)).sum()
+        return 0.5 * (self.kernel(landmarks, landmarks) * _products(momenta)).sum()
 
     def kernel(self, a: Tensor, b: Tensor) -> Tensor:
         """k of each with each: (..., n), (K, n) -> (..., K)."""
@@ -118,12 +119,12 @@ class LandmarkFlow(Diffeomorphism):
 
     def _pace(self, q: Tensor, p: Tensor, *moved: Tensor) -> State:
         kernel = self.kernel(q, q)
-        pull = 2 * (kernel / self.width).square() * (p @ p.mT)
-        paces = [kernel @ p, pull.sum(-1, keepdim=True) * q - pull @ q]
+        pull = 2 * (kernel / self.width).square() * _products(p)
+        paces = [_mixed(kernel, p), pull.sum(-1, keepdim=True) * q - _mixed(pull, q)]
         if moved:
             x, *tangents = moved
             kernel = self.kernel(x, q)
-            paces.append(kernel @ p)
+            paces.append(_mixed(kernel, p))
             # Dv t = Σ_j p_j (∂k_j/∂x)·t, and ∂k/∂x = -2 k² (x - q)/width²
             slopes = 2 * (kernel / self.width).square().unsqueeze(-1) * (q - x.unsqueeze(-2))
             paces += [p.mT @ (slopes @ tangent) for tangent in tangents]
@@ -139,12 +140,12 @@ class LandmarkFlow(Diffeomorphism):
         with torch.no_grad():
             kernel = self.kernel(landmarks, landmarks) + RIDGE * torch.eye(len(landmarks), dtype=torch.float64)
             # p = root⁻¹ u has the energy ½‖u‖²: in this measure of momenta L-BFGS gets farther than in p itself.
-            root = torch.linalg.cholesky(kernel).mT
-            scaled = nn.Parameter(root @ self.momenta)
+            root = np.linalg.cholesky(kernel.numpy()).T  # NumPy's: torch's rounds by how many threads it has
+            unscaled = torch.from_numpy(np.linalg.inv(root))
+            scaled = nn.Parameter(_mixed(torch.from_numpy(root.copy()), self.momenta))
 
         def momenta() -> Tensor:
-            solved: Tensor = torch.linalg.solve_triangular(root, scaled, upper=True)
-            return solved
+            return _mixed(unscaled, scaled)
 
         def loss() -> Tensor:
             arrived = self.carried(landmarks, momenta())[0]
@@ -165,6 +166,16 @@ class LandmarkFlow(Diffeomorphism):
 
 def even_steps(count: int) -> Tensor:
     return torch.full((count,), 1 / count, dtype=torch.float64)
+
+
+def _mixed(weights: Tensor, vectors: Tensor) -> Tensor:
+    """(..., K), (K, n) -> (..., n); no matrix product, whose rounding differs with threads and from batch to batch."""
+    return (weights.unsqueeze(-1) * vectors).sum(-2)
+
+
+def _products(p: Tensor) -> Tensor:
+    """p_i·p_j: (K, n) -> (K, K)."""
+    return (p.unsqueeze(-2) * p).sum(-1)
 
 
 def _ahead(state: State, slopes: State, step: Tensor) -> State:

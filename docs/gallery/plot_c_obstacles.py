@@ -26,8 +26,8 @@ times = torch.linspace(0, 3 * shown.duration, 400, dtype=torch.float64)
 around, middles = [], shown.positions[[90, 120, 150, 180]] + torch.tensor([0.03, -0.03])
 for middle in middles:
     path = AvoidingDS(ds, [sphere(middle, 0.15)]).rollout(shown.start, times).detach()
-    there = int((path - shown.goal).norm(dim=-1).lt(0.02).nonzero()[0])
-    around.append(Demonstration(path[: there + 1], float(times[1])))
+    there = int((path - shown.goal).norm(dim=-1).lt(0.02).nonzero()[0]) + 1
+    around.append(Demonstration(path[:there], float(times[1])))
 terms = AvoidanceTerms(DMP(2).fit(shown)).learn(around, middles)
 
 figure = Figure(figsize=(14, 4.6), layout="constrained")
@@ -42,5 +42,4 @@ for axes, drawn in ((panels[0], discs), (panels[2], discs[:1])):
         axes.add_patch(Circle(tuple(disc.center.tolist()), float(disc.half_axes[0]), color="#999999", zorder=3))
 panels[1].axhline(top, color="#222222", ls=":")
 for axes, title in zip(panels, ("AvoidingDS", "BoundedDS", "DMP with coupling terms"), strict=True):
-    axes.set_aspect("equal")
-    axes.set_title(title)
+    axes.set(aspect="equal", title=title)
