@@ -1,6 +1,7 @@
 """The reproduction: the paper's rule word for word, tuning and cells that are kept, claims against oracles."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -8,8 +9,9 @@ import pytest
 import torch
 import typer
 
+from baselines import LDDMM
 from experiments.compared import GREEDY, RIVALS, greedy
-from experiments.paper import latent_space, tuning
+from experiments.paper import latent_space, maps, tuning
 from experiments.paper.__main__ import main, reproduce
 from experiments.paper.document import similar
 from experiments.paper.planes import crossings
@@ -157,6 +159,7 @@ TINY = Plan(
 
 @pytest.mark.slow
 def test_a_run_writes_a_report_and_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    monkeypatch.setitem(maps.MAPS, "LDDMM", partial(LDDMM, n_landmarks=12, width=0.3, iterations=3))
     reproduce(TINY, tmp_path, tmp_path / "docs" / "reproduction.md", 1)
     written = (tmp_path / "docs" / "reproduction.md").read_text()
     assert "A quick run" in written
