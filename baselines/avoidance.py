@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 from scipy.signal import fftconvolve
 from torch import Tensor, nn
 
-from latentds.arguments import Array, check_points, real_tensor
+from latentds.arguments import Array, real_tensor
 from latentds.demonstration import Demonstration, demonstrations_of
 
 from .dmp import DMP, FADING, SPRING_HORIZON, STIFFNESS, basis
@@ -39,7 +39,7 @@ class AvoidanceTerms(nn.Module):
     :class:`latentds.modulation.AvoidingDS`.
 
     Args:
-        dmp: fitted to motions without an obstacle; kept, not changed.
+        dmp: fitted to motions without an obstacle; kept, not changed. Where it is fitted again, learn again.
 
     Attributes:
         weights: (5, 4) >= 0, of ``NARROWING`` and ``FADING_AWAY``, per duration; 0 until learned.
@@ -123,7 +123,8 @@ class AvoidanceTerms(nn.Module):
         dmp = self.dmp
         points, wanted = dmp._points(y0, "y0")
         place = real_tensor(obstacle, "obstacle").to(points)
-        check_points(dmp.dim, place, "obstacle")
+        if place.shape != (dmp.dim,) or not bool(torch.isfinite(place).all()):
+            raise ValueError(f"obstacle: expected ({dmp.dim},) finite numbers, got {obstacle!r:.80}")
         start, phases = points.cpu().double(), (dmp._times(t) / dmp.duration).cpu().double().numpy()
         weights, goal = dmp.weights.detach().cpu().double().numpy(), dmp.attractor.cpu().double().numpy()
         pace = dmp.departure.cpu().double().expand_as(start)

@@ -102,5 +102,7 @@ def test_weights_that_made_motions_are_found(terms):
 )
 def test_bad_input_is_refused(dmp, moved, obstacles, message):
     shown = datasets.drawn("wave", n_points=100)
+    with pytest.raises(ValueError, match="obstacle: expected"):
+        AvoidanceTerms(dmp).rollout(shown.start, shown.times, [0.0, float("nan")])
     with pytest.raises(ValueError, match=message):
         AvoidanceTerms(dmp).learn(Demonstration(shown.positions + moved, shown.dt), obstacles)
