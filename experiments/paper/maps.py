@@ -48,7 +48,7 @@ def maps(study: Study, document: Document) -> None:
         near, flow = row["path"], row["LDDMM"]
         errors = [f"{one['relative_mse']:.1e}" if one else "refused" for one in row.values()]
         both = [
-            [f"{one['fit_seconds']:.2g}", f"{one['gap']:.0e}", f"{one['inverse_ms']:.2g}"] if one else ["—"] * 3
+            [f"{one['fit_seconds']:.3g}", f"{one['gap']:.0e}", f"{one['inverse_ms']:.3g}"] if one else ["—"] * 3
             for one in (near, flow)
         ]
         lines.append([motion.name, *errors, *(part for pair in zip(*both, strict=True) for part in pair)])
